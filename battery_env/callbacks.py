@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -69,7 +68,6 @@ class CalibrationCallback(EventCallback):
         count for the best model, so that the history of a continued training is complete.
     :param best_model_save_path: Path to a folder where the best model (lowest mean of the first metric) will be saved
         as ``best_model.zip``.
-    :param callback_on_new_best: Callback to trigger when there is a new best model
     :param callback_after_eval: Callback to trigger after every evaluation
     :param verbose: Verbosity level: 0 for no output, 1 for indicating information about evaluation results
     """
@@ -81,18 +79,12 @@ class CalibrationCallback(EventCallback):
         metrics: Sequence[str] | Mapping[str, str] | None = None,
         log_path: str | os.PathLike[str] | None = None,
         best_model_save_path: str | os.PathLike[str] | None = None,
-        callback_on_new_best: BaseCallback | None = None,
         callback_after_eval: BaseCallback | None = None,
         verbose: int = 1,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
         if metrics is not None and (isinstance(metrics, str) or len(metrics) == 0):
             raise ValueError(f"metrics={metrics!r} must be a sequence of at least one column, like ('r_o_mape_percent',).")
-
-        self.callback_on_new_best = callback_on_new_best
-        if self.callback_on_new_best is not None:
-            # Give access to the parent
-            self.callback_on_new_best.parent = self
 
         self.evaluate = evaluate
         self.eval_freq = eval_freq
@@ -132,15 +124,10 @@ class CalibrationCallback(EventCallback):
                 self.history = [{str(name): value for name, value in record.items()} for record in records]
             self.best_objective = min((entry.get(self.objective, np.inf) for entry in self.history), default=np.inf)
 
-        # Init callback called on new best model
-        if self.callback_on_new_best is not None:
-            self.callback_on_new_best.init_callback(self.model)
-
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
             return True
 
-        continue_training = True
         trajectories = self.evaluate(self.model)
         entry = self._summarize(trajectories)
         for name, value in entry.items():
@@ -163,12 +150,8 @@ class CalibrationCallback(EventCallback):
             if self.best_model_save_path is not None:
                 with replacing(self.best_model_save_path / "best_model.zip") as part:
                     self.model.save(part)
-            # Trigger callback on new best model, if needed
-            if self.callback_on_new_best is not None:
-                continue_training = self.callback_on_new_best.on_step()
-
         # Trigger callback after every evaluation, if needed
-        return continue_training and self._on_event()
+        return self._on_event()
 
     def _add_to_history(self, entry: dict[str, float]) -> None:
         """Keep an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint)."""
@@ -204,9 +187,3 @@ class CalibrationCallback(EventCallback):
             summary[name] = float(trajectories[column].mean(skipna=False))
             summary[f"{name}_worst"] = float(trajectories[column].max(skipna=False))
         return summary
-
-    def update_child_locals(self, locals_: dict[str, Any]) -> None:
-        """Update the references to the local variables."""
-        super().update_child_locals(locals_)
-        if self.callback_on_new_best is not None:
-            self.callback_on_new_best.update_locals(locals_)

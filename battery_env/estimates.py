@@ -80,12 +80,6 @@ class Estimates(Sequence[Estimate]):
     :ivar settled: whether both numbers of each are settled
     :ivar settled_q_mobile: whether each ``q_mobile`` is
     :ivar settled_r_o: likewise
-    :param q_mobile: as above
-    :param r_o: likewise
-    :param sd_q_mobile: likewise
-    :param sd_r_o: likewise
-    :param settled_q_mobile: likewise
-    :param settled_r_o: likewise
     :param reason: of a cell by its number, why its estimate is not settled
     """
 
@@ -128,18 +122,19 @@ class Estimates(Sequence[Estimate]):
 @dataclass(frozen=True)
 class EstimateTrace:
     """
-    The estimates of one discharge in the order they were made, arrays of shape (K,), K >= 1.
+    The estimates of one discharge in the order they were made, arrays of shape (K,), K >= 1, with the units of
+    :class:`Estimate`. What the calibrator does not say is ``None``.
 
     :param time_s: time of the last sample that each estimate has seen, s
     :param q_mobile: C
     :param r_o: ohm
-    :param sd_q_mobile: stated standard deviations, C; ``None`` if the calibrator states none
+    :param sd_q_mobile: stated standard deviations, C
     :param sd_r_o: likewise, ohm
-    :param settled: whether the calibrator takes each estimate for settled; ``None`` if it does not say
-    :param reason: why each is not settled, strings, empty for those that are; ``None`` if the calibrator does not say
-    :param settled_q_mobile: whether it takes each ``q_mobile`` for settled; ``None`` if it does not say
+    :param settled: whether the calibrator takes each estimate for settled
+    :param reason: why each is not, strings, empty for those that are
+    :param settled_q_mobile: whether it takes each ``q_mobile`` for settled
     :param settled_r_o: likewise
-    :param constants: what else was found with each, as of :class:`Estimate`; ``None``: nothing
+    :param constants: what else was found with each, as of :class:`Estimate`
     """
 
     time_s: FloatArray
@@ -155,13 +150,7 @@ class EstimateTrace:
 
     @classmethod
     def of(cls, time_s: Sequence[float] | FloatArray, estimates: Sequence[Estimate]) -> EstimateTrace:
-        """
-        A trace of single estimates.
-
-        :param time_s: time of the last sample that each has seen, s
-        :param estimates: as many
-        :return: the trace
-        """
+        """A trace of single estimates, and the time of the last sample that each has seen, s."""
         names = (*_COLUMNS, "settled")
         columns: dict[str, Any] = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
         return cls(np.array(time_s), **columns, reason=np.array([estimate.reason for estimate in estimates], dtype=object))

@@ -173,16 +173,13 @@ def npz_path(path: str | os.PathLike[str]) -> Path:
 
 def load_npz(path: str | os.PathLike[str], kind: str, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read the arrays and the settings that :func:`save_npz` wrote."""
-    # data sets of earlier versions do not say what they are
-    arrays, settings = read_npz(path, kind, unstated=kind)
+    arrays, settings = read_npz(path, kind)
     if settings["format"] != version:
         raise ValueError(f"{path} has format {settings['format']}, this version reads {version}: make it again")
     return arrays, settings
 
 
-def read_npz(
-    path: str | os.PathLike[str], kind: str, unstated: str | None = None
-) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def read_npz(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read arrays and metadata of any format; refuse a damaged file, and one of another kind."""
     with Path(path).open("rb") as stream:
         head, size = stream.read(128), stream.seek(0, os.SEEK_END)
@@ -199,7 +196,7 @@ def read_npz(
                 if "metadata" not in file.files:
                     raise WrongFormatError("it does not say what it is")
                 metadata = json.loads(str(file["metadata"]))
-                if (found := metadata.get("kind", unstated)) != kind or "format" not in metadata:
+                if (found := metadata.get("kind")) != kind or "format" not in metadata:
                     raise WrongFormatError(f"it is a {found}")
                 return {name: np.asarray(file[name]) for name in file.files if name != "metadata"}, metadata
         except Exception as error:  # numpy and zipfile raise whatever the damage leads them to

@@ -40,11 +40,8 @@ class KnownLoad(ABC):
     @abstractmethod
     def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
         """
-        The mean of the load over steps: what a simulation in such steps has to take, so that it draws what the load does.
-
-        :param time_s: starts of the steps, s, at least 0, any shape
-        :param dt_s: length of the steps, s
-        :return: the load, same shape
+        The mean of the load over steps that start at some times, s: what a simulation in such steps takes to draw what the
+        load does.
         """
 
 
@@ -81,12 +78,7 @@ class Load(KnownLoad):
         return np.asarray(self.value[np.searchsorted(self.start_s, time, side="right") - 1])
 
     def on_grid(self, time_s: FloatArray) -> FloatArray:
-        """
-        The same for times in ascending order, many times faster: it looks up the segments instead of the times.
-
-        :param time_s: s, at least 0, ascending, shape (T,)
-        :return: the load, shape (T,)
-        """
+        """The same for times in ascending order, many times faster: it looks up the segments instead of the times."""
         bounds = np.append(np.searchsorted(time_s, self.start_s), len(time_s))
         return np.repeat(self.value, np.diff(bounds))
 
@@ -208,12 +200,8 @@ LoadToCome = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
 
 def known_load(load: Any, unit: LoadUnit) -> KnownLoad:
     """
-    A load from what is given of it.
-
-    :param load: a number, a function of time in s that takes an array, or a load of this module
-    :param unit: of a number or a function: ``"power"`` in W or ``"current"`` in A. Others have their own
-    :return: the load
-    :raises TypeError: for another type
+    A load from what is given of it: a load of this module, or a number or a function of time in s that takes an array, of some
+    unit.
     """
     if isinstance(load, KnownLoad):
         return load
@@ -230,11 +218,7 @@ def known_load(load: Any, unit: LoadUnit) -> KnownLoad:
 
 def in_steps(loads: Sequence[KnownLoad], dt_s: float) -> Loads:
     """
-    Loads for simulations in steps, over each of which their mean flows.
-
-    :param loads: one for all cells, or one a cell, all in one unit
-    :param dt_s: length of the steps, s
-    :return: what :func:`battery_env.electrochemistry.ends.run_down` takes
+    Loads, one for all cells or one a cell, all in one unit, for simulations in steps, over each of which their mean flows.
     """
 
     def over(time_s: FloatArray, cells: IntArray) -> FloatArray:
@@ -244,13 +228,7 @@ def in_steps(loads: Sequence[KnownLoad], dt_s: float) -> Loads:
 
 
 def constant(value: float, unit: LoadUnit = "power") -> Load:
-    """
-    The same load at all times.
-
-    :param value: power in W or current in A
-    :param unit: ``"power"`` or ``"current"``
-    :return: the load
-    """
+    """The same load at all times, power in W or current in A."""
     return Load(np.zeros(1), check_numbers("value", [value]), unit)
 
 
@@ -265,7 +243,6 @@ def recorded(record: Record, unit: LoadUnit = "power", dt_s: float = 1.0) -> Loa
     :param record: the discharge
     :param unit: ``"power"`` (voltage times current) or ``"current"``
     :param dt_s: time step of the simulation that is to follow it, s
-    :return: the load
     :raises ValueError: for another unit, or a time step that is not positive or longer than the record
     """
     if unit not in ("power", "current"):

@@ -14,21 +14,13 @@ from battery_env.checks import check_within
 
 @dataclass(frozen=True)
 class Parameter:
-    """
-    A parameter of the model that can be calibrated.
+    """A parameter of the model that can be calibrated."""
 
-    :param name: its name in code and in tables
-    :param symbol: its symbol, as TeX
-    :param unit: its unit in code and in messages
-    :param limits: least and largest value; they catch mistakes in the unit, and nonsense
-    :param hint: what a value beyond them usually is, a sentence
-    """
-
-    name: str
-    symbol: str
-    unit: str
-    limits: tuple[float, float]
-    hint: str
+    name: str  # in code and in tables
+    symbol: str  # as TeX
+    unit: str  # in code and in messages
+    limits: tuple[float, float]  # least and largest value; they catch mistakes in the unit, and nonsense
+    hint: str  # what a value beyond them usually is, a sentence
 
     @property
     def label(self) -> str:

@@ -98,7 +98,6 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
 
     :param figure: the figure
     :param path: where to; its suffix chooses the format
-    :return: the file
     """
     with replacing(path) as part:
         # not the resolution of matplotlib's settings, which other libraries change
@@ -113,7 +112,6 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
 
     :param scores: what :func:`battery_env.evaluation.evaluate` returned, by name of the calibrator
     :param parameter: ``"q_mobile"`` or ``"r_o"``
-    :return: the figure
     """
     figure = new_figure(3.1 * len(scores) + 0.9, 5.2)
     panels = figure.subplots(2, len(scores), sharex=True, sharey="row", height_ratios=[3, 2], squeeze=False)
@@ -139,11 +137,8 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
 def coloured(things: Iterable[Thing], variants_alike: bool = False) -> Iterator[tuple[str, Thing]]:
     """
     Things to draw side by side, names or tuples that start with one, each after its colour. The first with a name of
-    :data:`COLOUR_OF` has its colour; all others have those of :data:`COLOURS` that are left, which come again when they are
-    used up.
-
-    :param things: in the order in which they are drawn
-    :param variants_alike: all with a name of :data:`COLOUR_OF` have its colour, and are told apart by something else
+    :data:`COLOUR_OF` has its colour, or all have it that are told apart by something else; the others have those of
+    :data:`COLOURS` that are left, which come again when they are used up.
     """
     listed = list(things)
     own = [_own_colour(thing) for thing in listed]
@@ -185,7 +180,6 @@ def plot_learning_curves(
     :param title: title of the figure
     :param metric: what to show
     :param label: what readers call it
-    :return: the figure
     """
     figure = new_figure(7.2, 3.7)
     panels = {metric: "mean", f"{metric}_worst": "worst"}
@@ -252,12 +246,7 @@ class Expected(Protocol):
 
 
 def draw_end(axes: Axes, expected: Expected) -> None:
-    """
-    Draw what may come of a discharge: the voltage to expect, and the interval of its end.
-
-    :param axes: of voltage over time
-    :param expected: what may come
-    """
+    """Draw what may come of a discharge into axes of voltage over time: the voltage to expect, and the interval of its end."""
     inside = f"{100.0 * (BAND[2] - BAND[0]):.0f} %"
     time_s, (low_V, median_V, high_V), end_s = expected.time_s, expected.voltage_V, expected.eod_quantile_s()
     if np.isfinite(end_s).all():
@@ -278,7 +267,6 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
     :param fit: what :func:`battery_env.fit_cell` returned
     :param discharges: those it was fitted to, or others; of a :class:`~battery_env.Discharge` the part from load-on to the
         cut-off is taken
-    :return: the figure
     """
     figure = new_figure(3.2 * len(discharges) + 0.9, 4.8)
     panels = figure.subplots(2, len(discharges), sharey="row", sharex="col", height_ratios=[3, 2], squeeze=False)
@@ -421,7 +409,6 @@ def plot_estimates(
     :param traces: estimates of that discharge, by name of the calibrator
     :param true: the true parameters, if they are known
     :param bound: the least standard deviations that are possible, drawn around ``true``
-    :return: the figure
     :raises ValueError: for a bound without true parameters
     """
     if bound is not None and true is None:
@@ -481,7 +468,6 @@ def plot_sensitivities(slopes: Mapping[str, Sensitivities], at: Estimate) -> Fig
 
     :param slopes: what :func:`battery_env.estimators.cramer_rao.sensitivities` returned, by name for the legend
     :param at: the parameters of the discharges
-    :return: the figure
     """
     figure = new_figure(6.4, 4.6)
     upper, lower = figure.subplots(2, 1, sharex=True)

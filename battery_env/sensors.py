@@ -64,13 +64,7 @@ class SensorErrors:
         return gain * (voltage_V / read_V) if self.measured == "power" else gain
 
     def apply(self, trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
-        """
-        Read a discharge with these errors.
-
-        :param trajectory: as it is
-        :param rng: source of the noise
-        :return: the same with measured voltage and current
-        """
+        """Read the voltage and the current of a discharge with these errors; ``rng`` draws the noise."""
         voltage_V = trajectory.voltage_V
         read_V = self.read_voltage_V(voltage_V, rng.standard_normal(len(voltage_V)))
         current_A = self.gain(voltage_V, read_V) * trajectory.current_A + self.current_offset_A

@@ -143,7 +143,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param cell: constants of the cell, as a calibrator may know them, and what does not age; ``None``: the new cell's
         :param mismatch: how wrong they are: relative standard deviation of the factors, log-normal with median 1, that each
             of ``UNCERTAIN_CONSTANTS`` of each cell is multiplied by, at most 0.5. Ages and loads do not depend on it
-        :return: the data set
         :raises ValueError: for values out of range
         """
         aged = aged_parameters(parameters)
@@ -176,20 +175,15 @@ class TrajectoryDataset(Sequence[Trajectory]):
         thermal: bool = False,
     ) -> TrajectoryDataset:
         """
-        Discharges of ``n`` cells drawn along a path, whose constants age together with ``q_mobile`` and ``r_o``.
+        Discharges of ``n`` cells drawn along a path, whose constants age together with ``q_mobile`` and ``r_o``; loads, seed
+        and simulation as of :meth:`generate`. The ``cell`` of the data set has the constants that all ages share, as a
+        calibrator may know them.
 
         .. code-block:: python
 
           path = fit_life(load_nasa_discharges("B0006"))
           cells = TrajectoryDataset.along(path, n=100, loads=[constant(2.0, "current")], seed=0)
 
-        :param path: how cells of the kind age
-        :param n: number of discharges
-        :param loads: loads to choose from at random, or a sampler of loads
-        :param seed: seed of cells and loads
-        :param dt_s: time step, s
-        :param thermal: whether the temperature moves
-        :return: the data set; its ``cell`` has the constants that all ages share, as a calibrator may know them
         :raises ValueError: for values out of range
         """
         if not isinstance(path, AgingPath):
@@ -213,18 +207,15 @@ class TrajectoryDataset(Sequence[Trajectory]):
         equilibrium_V: ArrayLike | None = None,
     ) -> TrajectoryDataset:
         """
-        Discharge cells from full charge to the end of discharge.
+        Discharge cells from full charge to the end of discharge; ``dt_s``, ``thermal`` and ``cell`` are as of
+        :meth:`generate`.
 
         :param q_mobile: C, shape (n,)
         :param r_o: ohm, shape (n,)
         :param loads: the loads that occur, all in one unit
         :param load_index: which of them each cell gets, shape (n,)
-        :param dt_s: time step, s
-        :param thermal: whether the temperature moves
-        :param cell: constants of the cell, as a calibrator may know them; ``None``: the new cell's
         :param factors: what ``UNCERTAIN_CONSTANTS`` of each cell are multiplied by, shape (n, 4); ``None``: ones
         :param equilibrium_V: what is added to its equilibrium voltage, V, shape (n, 8); ``None``: nothing
-        :return: the data set
         :raises ValueError: for values out of range, or a discharge of fewer than eight samples
         """
         q, r = np.broadcast_arrays(*np.atleast_1d(Q_MOBILE.check(q_mobile), R_O.check(r_o)))
@@ -267,11 +258,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
 
     def trimmed(self, low: float, high: float) -> TrajectoryDataset:
         """
-        The same of which only a part of each discharge counts as data.
+        The same of which only a part of each discharge counts as data, from one share of its length to another one; of short
+        discharges four samples are left, whatever is trimmed.
 
-        :param low: where it begins, as a share of the length of the discharge
-        :param high: where it ends, likewise
-        :return: the data set; of short discharges four samples are left, whatever is trimmed
         :raises ValueError: unless 0 <= low < high <= 1
         """
         if not 0.0 <= low < high <= 1.0:
@@ -423,10 +412,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
 
     def subset(self, index: ArrayLike) -> TrajectoryDataset:
         """
-        Some of the trajectories.
-
-        :param index: which, shape (m,), in the order wanted
-        :return: a data set of them; the loads are shared with this one
+        A data set of some of the trajectories, by their numbers and in their order, which shares the loads with this one.
         """
         chosen = check_indices("index", index, len(self))
         if chosen.ndim != 1 or chosen.size == 0:
@@ -466,7 +452,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
         Save as an npz file (no pickle) that holds the arrays and, as JSON, constants, description and versions.
 
         :param path: where to; ``.npz`` is added if it is missing
-        :return: the file
         :raises FileExistsError: if the file exists already
         """
         versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": version("numba")}
@@ -479,7 +464,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
         Read what :meth:`save` wrote.
 
         :param path: the npz file
-        :return: the data set
         :raises ValueError: if the file is damaged, no such data set, or of another format version
         """
         arrays, settings = load_npz(path, _KIND, _FORMAT)

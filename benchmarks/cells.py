@@ -328,7 +328,8 @@ def fit_part(trained: str, tested: str, every: int) -> Tables:
         for discharge in load_nasa_discharges(tested)[::every]
         for constants, calibrator in calibrators.items()
     ]
-    return {"discharges": pd.DataFrame(rows), "constants": fit.constants_table().assign(fitted_to=trained)}
+    constants = pd.DataFrame(fit.constants).assign(identified=[each.identified for each in fit.constants], fitted_to=trained)
+    return {"discharges": pd.DataFrame(rows), "constants": constants}
 
 
 def fit_table(scores: pd.DataFrame) -> pd.DataFrame:

@@ -30,7 +30,8 @@ from tqdm import trange
 
 from battery_env import ExtendedKalmanFilter, OnnxPolicy, PolicyEstimator
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, step_into, voltage_into
-from battery_env.estimators.estimator import OnlineBatch, OnlineEstimator
+from battery_env.estimators.estimator import OnlineEstimator
+from battery_env.estimators.kalman import KalmanBatch
 from battery_env.records import Stream
 from benchmarks.study import Study, command_line, markdown, positive
 from sb3_lac import LAC
@@ -173,7 +174,7 @@ def filter_contestants(cells: int, folder: Path) -> dict[str, Callable[[], int]]
         ProgpyFilter("q_mobile", kind, 0.25 * NEW_CELL.q_mobile, 0.005).trace([record.part(0, count + 1)])
         return count
 
-    def batch(filters: OnlineBatch, at: Iterator[int]) -> int:
+    def batch(filters: KalmanBatch, at: Iterator[int]) -> int:
         for n in islice(at, _BATCH_SAMPLES):
             filters.update(record.voltage_V[n], 2.0, 1.0)
         return _BATCH_SAMPLES * cells

@@ -96,9 +96,8 @@ def columns() -> str:
 
 def estimators() -> str:
     """All calibrators that need no learning in one table."""
-    offered = [getattr(battery_env.estimators, name) for name in battery_env.estimators.__all__]
     rows = []
-    for calibrator in offered:
+    for _, calibrator in sorted(vars(battery_env.estimators).items()):
         if not (inspect.isclass(calibrator) and issubclass(calibrator, Estimator)) or inspect.isabstract(calibrator):
             continue
         # full states are what simulated discharges have and records in general have not

@@ -259,10 +259,10 @@ def test_a_batch_is_loaded_as_a_whole_and_fast(tmp_path):
     batch.update([4.1, 4.1, 4.1], 1.0, 0.0)
     file = batch.save(tmp_path / "cells.npz")
     content = dict(np.load(file))
-    content["all/filters"]["covariance"][2, 0, 0, 0, 0] = -1.0
+    content["filters"]["covariance"][2, 0, 0, 0] = -1.0
     np.savez(file, **content)
     other = ExtendedKalmanFilter().batch(3)
-    with pytest.raises(ValueError, match=r"cells\.npz: cell 2: its variance is none that a discharge leads to"):
+    with pytest.raises(ValueError, match=r"cells\.npz is damaged: its arrays are not those that were saved"):
         other.load(file)
     assert all(each._cells["seen"]["samples"][0] == 0 for each in other.estimators)
 

@@ -26,68 +26,32 @@ not to be confused with the libraries' ``qMax = qMobile / 0.6``), and ``r_o``, t
 One compiled kernel (numba) serves one cell and a million: every public function broadcasts over leading axes.
 """
 
-from battery_env.arrays import FloatArray
-from battery_env.checks import LoadUnit
-from battery_env.electrochemistry.cell import (
-    FULL_CHARGE_SHARES,
-    NEW_CELL,
-    QNB,
-    QNS,
-    QPB,
-    QPS,
-    STATE_NAMES,
-    STATE_SIZE,
-    TB,
-    UNCERTAIN_CONSTANTS,
-    VO,
-    VSN,
-    VSP,
-    CellParameters,
-    PackedConstants,
-    check_cell,
-    check_dt,
-    rest_shares,
-)
-from battery_env.electrochemistry.simulation import (
-    Trajectory,
-    advance_in_place,
-    initial_state,
-    simulate,
-    state_of_charge,
-    step,
-    step_into,
-    voltage,
-    voltage_into,
-)
-
-__all__ = [
-    "FULL_CHARGE_SHARES",
-    "NEW_CELL",
-    "QNB",
-    "QNS",
-    "QPB",
-    "QPS",
-    "STATE_NAMES",
-    "STATE_SIZE",
-    "TB",
-    "UNCERTAIN_CONSTANTS",
-    "VO",
-    "VSN",
-    "VSP",
-    "CellParameters",
-    "FloatArray",
-    "LoadUnit",
-    "PackedConstants",
-    "Trajectory",
-    "advance_in_place",
-    "check_cell",
-    "check_dt",
-    "initial_state",
-    "rest_shares",
-    "simulate",
-    "state_of_charge",
-    "step",
-    "step_into",
-    "voltage",
-    "voltage_into",
-]
+from battery_env.arrays import FloatArray as FloatArray
+from battery_env.checks import LoadUnit as LoadUnit
+from battery_env.electrochemistry.cell import FULL_CHARGE_SHARES as FULL_CHARGE_SHARES
+from battery_env.electrochemistry.cell import NEW_CELL as NEW_CELL
+from battery_env.electrochemistry.cell import QNB as QNB
+from battery_env.electrochemistry.cell import QNS as QNS
+from battery_env.electrochemistry.cell import QPB as QPB
+from battery_env.electrochemistry.cell import QPS as QPS
+from battery_env.electrochemistry.cell import STATE_NAMES as STATE_NAMES
+from battery_env.electrochemistry.cell import STATE_SIZE as STATE_SIZE
+from battery_env.electrochemistry.cell import TB as TB
+from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS as UNCERTAIN_CONSTANTS
+from battery_env.electrochemistry.cell import VO as VO
+from battery_env.electrochemistry.cell import VSN as VSN
+from battery_env.electrochemistry.cell import VSP as VSP
+from battery_env.electrochemistry.cell import CellParameters as CellParameters
+from battery_env.electrochemistry.cell import PackedConstants as PackedConstants
+from battery_env.electrochemistry.cell import check_cell as check_cell
+from battery_env.electrochemistry.cell import check_dt as check_dt
+from battery_env.electrochemistry.cell import rest_shares as rest_shares
+from battery_env.electrochemistry.simulation import Trajectory as Trajectory
+from battery_env.electrochemistry.simulation import advance_in_place as advance_in_place
+from battery_env.electrochemistry.simulation import initial_state as initial_state
+from battery_env.electrochemistry.simulation import simulate as simulate
+from battery_env.electrochemistry.simulation import state_of_charge as state_of_charge
+from battery_env.electrochemistry.simulation import step as step
+from battery_env.electrochemistry.simulation import step_into as step_into
+from battery_env.electrochemistry.simulation import voltage as voltage
+from battery_env.electrochemistry.simulation import voltage_into as voltage_into

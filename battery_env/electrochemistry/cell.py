@@ -183,32 +183,18 @@ class CellParameters:
             raise ValueError(f"CellParameters: VolSFraction is a share and must be less than 1, got {self.VolSFraction!r}")
 
     def replace(self, **changes: Any) -> CellParameters:
-        """
-        A copy with some constants changed.
-
-        :param changes: constants by name
-        :return: the changed copy
-        """
+        """A copy with some constants changed."""
         return replace(self, **changes)
 
     def to_json(self, path: str | os.PathLike[str]) -> Path:
-        """
-        Save the constants.
-
-        :param path: where to
-        :return: the file
-        :raises FileExistsError: if the file exists already
-        """
+        """Save the constants to a new file; a ``FileExistsError`` if it exists already."""
         return write_json(path, _FORMAT, _FORMAT_VERSION, {"constants": asdict(self)})
 
     @classmethod
     def from_json(cls, path: str | os.PathLike[str]) -> CellParameters:
         """
-        Load constants.
-
-        :param path: what :meth:`to_json` wrote
-        :return: the constants
-        :raises ValueError: if the file is damaged, was not written so, or is of another format version
+        Load what :meth:`to_json` wrote; a ``ValueError`` for a file that is damaged, another one, or of another format
+        version.
         """
         content = read_json(path, _FORMAT, _FORMAT_VERSION)
         try:
@@ -222,7 +208,6 @@ class CellParameters:
         Constants by name, as JSON holds them.
 
         :param constants: every one of them
-        :return: the cell
         :raises TypeError: for what is no mapping, or a value of another kind
         :raises ValueError: for a constant that is missing, unknown or out of range
         """
@@ -237,9 +222,7 @@ class CellParameters:
     @cached_property
     def packed(self) -> PackedConstants:
         """
-        What the compiled kernels read: constants of the equations, and both equilibrium-potential polynomials.
-
-        :return: one row of constants, and the polynomials
+        What the compiled kernels read: one row of constants of the equations, and both equilibrium-potential polynomials.
         """
         volume_surface = self.VolSFraction * self.Vol
         constants = np.empty((1, CONSTANTS_SIZE))
@@ -261,10 +244,8 @@ class CellParameters:
 
     def packed_with(self, factors: FloatArray) -> PackedConstants:
         """
-        Constants of many cells that differ from this one in what is known least, for the unchecked functions.
-
-        :param factors: what each of ``UNCERTAIN_CONSTANTS`` is multiplied by, shape (n, 4)
-        :return: constants with one row a cell
+        Constants of many cells, one row each, that differ from this one in what is known least: ``UNCERTAIN_CONSTANTS`` are
+        multiplied by factors of shape (n, 4).
         """
         packed = self.packed
         constants = np.repeat(packed.constants, len(factors), axis=0)

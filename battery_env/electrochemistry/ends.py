@@ -83,43 +83,28 @@ class Cells(NamedTuple):
 
 class Loads(NamedTuple):
     """
-    What is to come.
-
-    :param over: the load over the steps that start at some times, s, shape (K,), for some of the cells: W or A, shape
-        (cells, K), or (1, K) where all have the same
-    :param unit: ``"power"`` in W or ``"current"`` in A
-    :param until_s: after this time nothing is drawn any more, s, shape (n,) or (1,); infinite where that is not known
+    What is to come: over steps that start at some times, s, shape (K,), and for some of the cells, the load in W or A, shape
+    (cells, K), or (1, K) where all have the same.
     """
 
     over: Callable[[FloatArray, IntArray], FloatArray]
-    unit: LoadUnit
-    until_s: FloatArray
+    unit: LoadUnit  # "power" in W or "current" in A
+    until_s: FloatArray  # nothing is drawn any more then, s, shape (n,) or (1,); infinite: not known
 
 
 class Ends(NamedTuple):
-    """
-    Where the discharges of n cells end.
+    """Where the discharges of n cells end."""
 
-    :param time_s: from now on, s, shape (n,); infinite where the cut-off is not reached within a week
-    :param capacity_Ah: charge that is given from full to the end, Ah, shape (n,); NaN likewise
-    :param course_s: times of the course, s, shape (K,)
-    :param course_V: quantiles :data:`BAND` of the voltage then, shape (3, K); a discharge that has ended counts as at the
-        cut-off
-    """
-
-    time_s: FloatArray
-    capacity_Ah: FloatArray
-    course_s: FloatArray
-    course_V: FloatArray
+    time_s: FloatArray  # from now on, s, shape (n,); infinite where the cut-off is not reached within a week
+    capacity_Ah: FloatArray  # given from full to the end, Ah, shape (n,); NaN likewise
+    course_s: FloatArray  # times of the course, s, shape (K,)
+    course_V: FloatArray  # quantiles BAND of the voltage then, shape (3, K); after its end a discharge is at the cut-off
 
 
 def quantile(values: FloatArray, probability: ArrayLike = BAND) -> FloatArray:
     """
-    Quantiles over cells that are equally likely, the first axis.
-
-    :param values: shape (n, ...)
-    :param probability: within 0 .. 1, any shape
-    :return: shape of ``probability``, then the others
+    Quantiles over cells that are equally likely, along the first axis of some values: shape of ``probability``, then the
+    others.
     """
     # of the cells themselves: between two of them there is no number if one is infinite
     return np.asarray(np.quantile(values, np.asarray(probability, dtype=np.float64), axis=0, method="inverted_cdf"))
@@ -134,16 +119,9 @@ def run_down(
     surplus_share: float = SURPLUS_SHARE,
 ) -> Ends:
     """
-    The one way to the end of a discharge: take cells down to the cut-off, side by side, for a week at most.
-
-    :param cells: now
-    :param model: how they are simulated
-    :param loads: what is to come
-    :param cut_off_V: where a discharge ends, V
-    :param every_s: how often to keep the course of the voltage, s; ``None``: it is not kept
-    :param surplus_share: how much more than full a load may charge a cell, as a share of its charge
-    :return: their ends
-    :raises ValueError: for a load that charges a cell beyond full
+    The one way to the end of a discharge: take cells down to the cut-off, side by side, for a week at most. The course of the
+    voltage is kept every so often, s, if at all. A load that charges a cell further beyond full than a share of its charge is
+    refused.
     """
     count, dt_s, power = len(cells.q_mobile), model.dt_s, loads.unit == "power"
     until = np.broadcast_to(np.ceil(np.minimum(loads.until_s, LONGEST_S) / dt_s - 1e-9), count)
@@ -159,7 +137,10 @@ def run_down(
         part_V = np.full((len(going), len(rows)), cut_off_V)
         overfull = _run_on(load, part, dt_s, power, model.thermal, model.cell.packed, limits, places, ahead, part_V)
         if overfull >= 0:
-            raise overfull_error(dt_s * overfull)
+            raise ValueError(
+                f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after "
+                f"{dt_s * overfull:g} s. Positive loads discharge: check its sign, or begin with the discharge."
+            )
         followed[:, going], state[going], shown_V[going] = part, ahead, part_V
         course.append((first + rows, quantile(shown_V)))
         first += _CHUNK_STEPS
@@ -177,14 +158,8 @@ def run_down(
 
 def follow(cells: Cells, model: Model, current_A: FloatArray, shown: int) -> tuple[Cells, FloatArray]:
     """
-    Take cells through a current that was measured.
-
-    :param cells: at its start
-    :param model: how they are simulated
-    :param current_A: over each step, A, shape (K,)
-    :param shown: the voltages of so many steps are asked for, the last ones
-    :return: the cells at its end; and their voltages before each of these steps, and at the end, V, shape (n, shown + 1), NaN
-        once a cell is empty
+    Take cells through a current that was measured, over each step, A: to its end, with their voltages before each of so many
+    last steps, and then, V, shape (n, shown + 1), NaN once a cell is empty.
     """
     count, state, split = len(cells.q_mobile), cells.state.copy(), len(current_A) - shown
     followed, voltage_V = _followed(cells, np.full(count, np.inf)), np.full((count, shown + 1), np.nan)
@@ -202,14 +177,6 @@ def _followed(cells: Cells, until: FloatArray) -> FloatArray:
     """What is followed of cells, at first."""
     known = (cells.q_mobile, cells.r_o, cells.error_V, cells.drift_V, cells.soc, until)
     return np.vstack([*known, np.repeat(np.array(_AT_FIRST)[:, None], len(until), axis=1)])
-
-
-def overfull_error(after_s: float) -> ValueError:
-    """What to say of a load that charges a cell by more than it takes."""
-    return ValueError(
-        f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after {after_s:g} s. Positive "
-        "loads discharge: check its sign, or begin with the discharge."
-    )
 
 
 @compiled

@@ -18,12 +18,8 @@ _FRACTIONS_P = (0.4, 1.0)
 
 def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
     """
-    A cell with another equilibrium voltage. ``U0p`` and ``Ap`` can make exactly what is added.
-
-    :param cell: the cell
-    :param coefficients_V: what is added: coefficients of Legendre polynomials 0, 1, ... over the mole fractions of the
-        positive electrode that a discharge passes through, V
-    :return: the other cell
+    A cell with another equilibrium voltage, which ``U0p`` and ``Ap`` can make exactly. What is added is given by coefficients
+    of Legendre polynomials 0, 1, ... over the mole fractions of the positive electrode that a discharge passes through, V.
     """
     # as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
     # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
@@ -40,11 +36,7 @@ def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | Flo
 
 def equilibrium_slopes(fraction_p: FloatArray, count: int) -> FloatArray:
     """
-    The derivatives of the voltage by what :func:`with_equilibrium` adds.
-
-    :param fraction_p: mole fractions at the surface of the positive electrode, shape (K,)
-    :param count: of the coefficients
-    :return: shape (count, K)
+    The derivatives of the voltage by these coefficients at some mole fractions of the positive electrode, shape (count, K).
     """
     return np.asarray(legvander(on_unit_range(fraction_p), count - 1).T)
 

@@ -232,13 +232,7 @@ class Trajectory:
         return float(np.interp(voltage_V, self.voltage_V[[n, n - 1]], self.time_s[[n, n - 1]]))
 
     def part(self, first: int, stop: int) -> Trajectory:
-        """
-        The samples ``first`` .. ``stop - 1``; time keeps its origin.
-
-        :param first: first sample
-        :param stop: one past the last sample
-        :return: the part
-        """
+        """The samples ``first`` .. ``stop - 1``; time keeps its origin."""
         window = slice(first, stop)
         return replace(
             self,

@@ -58,12 +58,7 @@ BY_Q, BY_R, BY_KN, BY_KP, BY_T_DIFFUSION, BY_TO, BY_TSN, BY_TSP = range(len(TANG
 
 class PolynomialDerivatives(NamedTuple):
     """
-    The derivatives of both equilibrium-potential polynomials, laid out as the polynomials, each of shape (14,).
-
-    :param slope_n: first derivative, of the negative electrode, V
-    :param slope_p: first derivative, of the positive electrode, V
-    :param curvature_n: second derivative, of the negative electrode, V
-    :param curvature_p: second derivative, of the positive electrode, V
+    The first and second derivatives of both equilibrium-potential polynomials, V, laid out as the polynomials, shape (14,).
     """
 
     slope_n: FloatArray

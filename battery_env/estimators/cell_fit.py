@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
@@ -201,7 +200,6 @@ class CellFit:
         that was fitted: a cell does not grow. Without that bound the first quarter of a discharge allows for far larger ones.
 
         :param arguments: others of :class:`~battery_env.LeastSquares`; they replace these
-        :return: the calibrator
         """
         own = {
             "cell": self.cell,
@@ -234,21 +232,8 @@ class CellFit:
         q_C = np.array([discharge.q_mobile for discharge in self.discharges])
         return float(q_C.min()) * exp(-unseen_of_life(q_C)) / _GROWTH, self.q_mobile_bounds_C[1]
 
-    def constants_table(self) -> pd.DataFrame:
-        """
-        The constants before and after, and how sure they are.
-
-        :return: one row a constant, the fields of :class:`FittedConstant` and ``identified``
-        """
-        table = pd.DataFrame(self.constants)
-        return table.assign(identified=[constant.identified for constant in self.constants])
-
     def summary(self) -> str:
-        """
-        The fit in a few lines.
-
-        :return: text for a terminal
-        """
+        """The fit in a few lines."""
         before_V = np.sqrt(np.mean([discharge.rmse_before_V**2 for discharge in self.discharges]))
         lines = [
             f"{len(self.discharges)} discharges, voltage RMSE {1e3 * before_V:.1f} mV before, {1e3 * self.rmse_V:.1f} mV "
@@ -280,23 +265,14 @@ class CellFit:
         return "\n".join(lines)
 
     def to_json(self, path: str | os.PathLike[str]) -> Path:
-        """
-        Save the fit.
-
-        :param path: where to
-        :return: the file
-        :raises FileExistsError: if the file exists already
-        """
+        """Save the fit to a new file; a ``FileExistsError`` if it exists already."""
         return write_json(path, _FORMAT, _FORMAT_VERSION, asdict(self))
 
     @classmethod
     def from_json(cls, path: str | os.PathLike[str]) -> CellFit:
         """
-        Load a fit.
-
-        :param path: what :meth:`to_json` wrote
-        :return: the fit
-        :raises ValueError: if the file is damaged, was not written so, or is of another format version
+        Load what :meth:`to_json` wrote; a ``ValueError`` for a file that is damaged, another one, or of another format
+        version.
         """
         content = read_json(path, _FORMAT, _FORMAT_VERSION)
         try:

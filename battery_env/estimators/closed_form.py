@@ -50,12 +50,7 @@ class ClosedForm(Estimator):
         return Estimate(q_mobile, r_o, **diagnosis.verdict(values, sds)._asdict())
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]
-        """
-        One estimate for every step of many discharges.
-
-        :param records: simulated discharges of at least two samples
-        :return: one trace per discharge, in the same order
-        """
+        """One estimate for every step of simulated discharges of at least two samples."""
         traces = []
         for record in records:
             ohmic = record.state[:, VO]

@@ -49,24 +49,6 @@ class CramerRaoBound:
     sd_q_mobile: FloatArray
     sd_r_o: FloatArray
 
-    @classmethod
-    def of(
-        cls, slopes: Sensitivities, voltage_noise_V: float, parameters: Sequence[str] = PARAMETER_NAMES, offset: bool = False
-    ) -> CramerRaoBound:
-        """Return the bound that sensitivities imply."""
-        names = check_parameters(parameters)
-        if not 0.0 < voltage_noise_V < np.inf:
-            raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}")
-        by_parameter = {"q_mobile": slopes.by_q_mobile_V_per_C, "r_o": slopes.by_r_o_A}
-        columns = [by_parameter[name] for name in names]
-        if offset:
-            columns.append(np.ones(len(slopes.time_s)))
-        gradient = np.column_stack(columns) / voltage_noise_V
-        variance = _inverse_diagonals(np.cumsum(gradient[:, :, None] * gradient[:, None, :], axis=0))
-        sd = dict.fromkeys(PARAMETER_NAMES, np.full(len(slopes.time_s), np.nan))
-        sd |= {name: np.sqrt(variance[:, n]) for n, name in enumerate(names)}
-        return cls(slopes.time_s, sd["q_mobile"], sd["r_o"])
-
 
 def sensitivities(record: Record, at: Estimate | None = None, model: RecordModel | None = None) -> Sensitivities:
     """
@@ -75,7 +57,6 @@ def sensitivities(record: Record, at: Estimate | None = None, model: RecordModel
     :param record: one discharge, of which only time and current are used
     :param at: the parameters; ``None``: the true ones of a simulated discharge
     :param model: the model; ``None``: isothermal, in steps of 1 s, of a new cell that is full at the first sample
-    :return: voltage and derivatives
     :raises ValueError: for a recorded discharge without parameters
     """
     if at is None:
@@ -98,22 +79,31 @@ def cramer_rao_bound(
     model: RecordModel | None = None,
 ) -> CramerRaoBound:
     """
-    Return the bound for a voltage sensor with white normal noise and an exact current, over time as the record grows:
-    sd^2 = diag((sum over samples of g g^T)^-1) * noise^2, g the derivatives of the voltage with respect to all unknowns.
+    Return the bound for a voltage sensor with white normal noise and an exact current, over time as the record grows: sd^2 =
+    diag((sum over samples of g g^T)^-1) * noise^2, g the derivatives of the voltage with respect to all unknowns
+    (:func:`sensitivities`, which has ``record``, ``at`` and ``model``).
 
     What is known exactly is the current. Were it the power, the current would give the parameters away a little as well, and
     the bound would be lower by 5 to 30 %.
 
-    :param record: one discharge, of which only time and current are used
     :param voltage_noise_V: standard deviation of the noise, V
     :param parameters: which are unknown: ``"q_mobile"``, ``"r_o"`` or both; the other one is known
     :param offset: whether the sensor has an unknown constant offset as well
-    :param at: the parameters; ``None``: the true ones of a simulated discharge
-    :param model: the model; ``None``: isothermal, in steps of 1 s, of a new cell that is full at the first sample
-    :return: the bound
     :raises ValueError: for an argument out of range, or a record that cannot be used
     """
-    return CramerRaoBound.of(sensitivities(record, at, model), voltage_noise_V, parameters, offset)
+    names = check_parameters(parameters)
+    if not 0.0 < voltage_noise_V < np.inf:
+        raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}")
+    slopes = sensitivities(record, at, model)
+    by_parameter = {"q_mobile": slopes.by_q_mobile_V_per_C, "r_o": slopes.by_r_o_A}
+    columns = [by_parameter[name] for name in names]
+    if offset:
+        columns.append(np.ones(len(slopes.time_s)))
+    gradient = np.column_stack(columns) / voltage_noise_V
+    variance = _inverse_diagonals(np.cumsum(gradient[:, :, None] * gradient[:, None, :], axis=0))
+    sd = dict.fromkeys(PARAMETER_NAMES, np.full(len(slopes.time_s), np.nan))
+    sd |= {name: np.sqrt(variance[:, n]) for n, name in enumerate(names)}
+    return CramerRaoBound(slopes.time_s, sd["q_mobile"], sd["r_o"])
 
 
 def _inverse_diagonals(information: FloatArray) -> FloatArray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
 from battery_env.arrays import FloatArray
-from battery_env.checks import check_numbers, check_whole_number
+from battery_env.checks import check_numbers
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, state_of_charge, voltage
 from battery_env.electrochemistry.ends import BAND, LONGEST_S, Cells, run_down
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
-from battery_env.estimators.state_files import load_state, refusing, save_state
+from battery_env.estimators.state_files import load_state, save_state
 from battery_env.loads import KnownLoad, Load, in_steps, known_load
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
@@ -27,28 +26,17 @@ from battery_env.records import Record, Stream
 _ROUNDING = 1e-9
 
 
-# Of which cells an array of a saved batch is, in place of a number.
-_ALL = "all"
-
-
 class Estimator(ABC):
     """A calibrator: from the record of a discharge to (q_mobile, r_o), without labels."""
 
     @abstractmethod
     def estimate(self, record: Record) -> Estimate:
-        """
-        The estimate after the whole record.
-
-        :param record: one discharge
-        :return: the estimate
-        """
+        """The estimate after the whole record of one discharge."""
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
-        The estimates over time of many discharges; a calibrator that only looks back gives one each, at the end.
-
-        :param records: discharges
-        :return: one trace per discharge, in the same order
+        The estimates over time of many discharges, in their order; a calibrator that only looks back gives one each, at the
+        end.
         """
         return [EstimateTrace.of([record.time_s[-1]], [self.estimate(record)]) for record in records]
 
@@ -95,13 +83,7 @@ class ModelNow(NamedTuple):
     deviations: FloatArray
 
     def draws(self, samples: int, rng: np.random.Generator) -> Cells:
-        """
-        Cells that may be the one that was followed, all equally likely: state, parameters and offset belong together.
-
-        :param samples: how many
-        :param rng: what draws them
-        :return: these
-        """
+        """Cells that may be the one that was followed, all equally likely: state, parameters and offset belong together."""
         middle = np.concatenate([self.state, self.parameters])
         points = middle + rng.standard_normal((samples, len(self.deviations))) @ self.deviations
         for n, parameter in enumerate(PARAMETERS.values(), start=STATE_SIZE):
@@ -140,7 +122,6 @@ class OnlineEstimator(Estimator):
         :param dt_s: time since the previous sample, s; without meaning at the first one. The current of the previous sample
             has flowed all the time
         :param temperature_C: of the cell, degC; ``None``: not measured
-        :return: the estimate
         :raises TypeError: for what is no number
         :raises ValueError: for invalid values; after either error the estimator is as it was
         """
@@ -148,22 +129,10 @@ class OnlineEstimator(Estimator):
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
 
-    def batch(self, cells: int) -> OnlineBatch:
-        """
-        Estimators like this one, each for a cell of its own.
-
-        :param cells: how many
-        :return: these, before their first samples
-        :raises ValueError: for no cells
-        """
-        return OnlineBatch(self, cells)
-
     def now(self) -> ModelNow:
         """
-        The model at the last sample; what ``soc``, ``voltage_V`` and :meth:`remaining` are told from.
-
-        :return: where it stands
-        :raises NotImplementedError: of an estimator that has none
+        Where the model stands at the last sample, which ``soc``, ``voltage_V`` and :meth:`remaining` are told from, if there
+        is one.
         """
         raise NotImplementedError(f"{type(self).__name__} has no model that follows the discharge")
 
@@ -173,10 +142,6 @@ class OnlineEstimator(Estimator):
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """What it knows of the discharge, by name."""
-        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
-
-    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Refuse, with a ValueError, what :meth:`_arrays` of no discharge can be."""
         raise NotImplementedError(f"{type(self).__name__} cannot be saved")
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
@@ -211,7 +176,6 @@ class OnlineEstimator(Estimator):
             start of each step does. Under a negative number, a charge, the cut-off is never reached
         :param cut_off_V: V; ``None``: the ``VEOD`` of the cell
         :param load_unit: of a number, an array or a function: ``"current"`` in A or ``"power"`` in W
-        :return: time and standard deviation
         :raises ValueError: for an invalid load, also for one that varies and charges the cell beyond full, and for
             an array that ends before the discharge does
         """
@@ -243,7 +207,6 @@ class OnlineEstimator(Estimator):
         Write what the estimator knows of the discharge to a file, from which another one with the same arguments goes on.
 
         :param path: where to; ``.npz`` is added if it is missing. An older state there is replaced, any other file is not
-        :return: the file
         :raises FileExistsError: if there is another file
         """
         return save_state(path, self._made_with(), self._arrays())
@@ -257,132 +220,26 @@ class OnlineEstimator(Estimator):
         :raises ValueError: if it is damaged, of another version, of an estimator with other arguments, or holds what no
             discharge leads to; the estimator is as it was then
         """
-        arrays = load_state(path, self._made_with())
-        with refusing(path):
-            self._check_state(arrays)
-        self._restore(arrays)
+        self._restore(load_state(path, self._made_with()))
 
     def estimate(self, record: Record) -> Estimate:
-        """
-        The estimate at the last sample of a record.
-
-        :param record: one discharge
-        :return: the estimate
-        :raises ValueError: if the record cannot be used
-        """
+        """The estimate at the last sample of a record; a ``ValueError`` if that cannot be used."""
         return last_estimate(self.trace([record])[0])
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
-        """
-        One estimate for every sample of many discharges. A temperature that was measured is taken in with each sample.
-
-        :param records: discharges
-        :return: one trace per discharge, in the same order
-        :raises ValueError: if a record cannot be used
-        """
+        """One estimate for every sample of many discharges. A temperature that was measured is taken in with each sample."""
         traces = [self.follow(record) for record in records]
         self.reset()
         return traces
 
     def follow(self, record: Record) -> EstimateTrace:
-        """
-        One estimate for every sample of a discharge, after which the estimator stands at the last one.
-
-        :param record: one discharge
-        :return: the estimates
-        :raises ValueError: if the record cannot be used
-        """
+        """One estimate for every sample of a discharge, after which the estimator stands at the last one."""
         stream = Stream.of(record, self.dt_s)
         measured: Iterable[tuple[float, ...]] = stream.samples()
         if stream.temperature_C is not None:
             measured = ((*sample, t_C) for sample, t_C in zip(measured, stream.temperature_C.tolist(), strict=True))
         self.reset()
         return EstimateTrace.of(stream.time_s, [self.update(*sample) for sample in measured])
-
-
-class OnlineBatch:
-    """
-    Cells side by side, each followed by an estimator of its own with the same arguments.
-
-    :ivar estimators: these
-    :param estimator: what to copy; it stays as it is
-    :param cells: how many
-    :raises ValueError: for no cells
-    """
-
-    def __init__(self, estimator: OnlineEstimator, cells: int) -> None:
-        if check_whole_number("cells", cells) < 1:
-            raise ValueError(f"cells must be at least 1, got {cells!r}")
-        self.estimators: Sequence[OnlineEstimator] = self._copies(estimator, cells)
-        self.reset()
-
-    def _copies(self, estimator: OnlineEstimator, cells: int) -> Sequence[OnlineEstimator]:
-        return [copy(estimator) for _ in range(cells)]
-
-    def reset(self, cells: Iterable[int] | None = None) -> None:
-        """Let discharges begin."""
-        for n in range(len(self.estimators)) if cells is None else cells:
-            self.estimators[n].reset()
-
-    def update(
-        self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
-    ) -> Sequence[Estimate]:
-        """Take in one sample of each cell: of all, or of none if one is refused."""
-        samples = self.check(voltage_V, current_A, dt_s, temperature_C)
-        return [estimator.update(*sample) for estimator, sample in zip(self.estimators, samples, strict=True)]
-
-    def check(
-        self,
-        voltage_V: ArrayLike,
-        current_A: ArrayLike,
-        dt_s: ArrayLike,
-        temperature_C: ArrayLike | None = None,
-        cells: Iterable[int] | None = None,
-    ) -> list[tuple[Any, ...]]:
-        """Refuse what :meth:`update` would refuse, of these cells or of all; return the samples of all."""
-        count = len(self.estimators)
-        # as objects, so that what is no number turns no other one into a text
-        columns = (np.asarray(column, dtype=object) for column in (voltage_V, current_A, dt_s, temperature_C))
-        samples = list(zip(*(np.broadcast_to(column, count).tolist() for column in columns), strict=True))
-        for n in range(count) if cells is None else cells:
-            try:
-                self.estimators[n].check(*samples[n])
-            except (TypeError, ValueError) as error:
-                raise type(error)(f"cell {n}: {error}") from error
-        return samples
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write what is known of all cells, as :meth:`OnlineEstimator.save`."""
-        parts, arrays = [each._arrays() for each in self.estimators], {}
-        for name in dict.fromkeys(name for part in parts for name in part):
-            found = [part.get(name, np.empty(0)) for part in parts]
-            if len({(array.dtype, array.shape) for array in found}) == 1:  # one array takes a thousandth of the time
-                arrays[f"{_ALL}/{name}"] = np.stack(found)
-            else:
-                arrays |= {f"{n}/{name}": part[name] for n, part in enumerate(parts) if name in part}
-        return save_state(path, self._made_with(), arrays)
-
-    def load(self, path: str | os.PathLike[str]) -> None:
-        """Go on from what :meth:`save` wrote."""
-        parts: list[dict[str, NDArray[Any]]] = [{} for _ in self.estimators]
-        with refusing(path):
-            for name, array in load_state(path, self._made_with()).items():
-                number, _, own_name = name.partition("/")
-                if number == _ALL and len(array) == len(parts):
-                    for part, own in zip(parts, array, strict=True):
-                        part[own_name] = own
-                elif number.isdecimal() and int(number) < len(parts):
-                    parts[int(number)][own_name] = array
-                else:
-                    raise ValueError(f"arrays that are missing or unknown: {name}")
-            for n, (estimator, part) in enumerate(zip(self.estimators, parts, strict=True)):
-                with refusing(f"cell {n}"):
-                    estimator._check_state(part)
-        for estimator, part in zip(self.estimators, parts, strict=True):
-            estimator._restore(part)
-
-    def _made_with(self) -> dict[str, Any]:
-        return {"cells": len(self.estimators), **self.estimators[0]._made_with()}
 
 
 def check_bounds(

@@ -151,21 +151,14 @@ class GreedyOneStep(Estimator):
 
     def estimate(self, record: Trajectory) -> Estimate:  # type: ignore[override]
         """
-        The estimate of the last step.
-
-        :param record: a simulated discharge (no recording has the full state) of at least two samples
-        :return: the estimate; the other parameter is the true one
+        The estimate of the last step of a simulated discharge (no recording has the full state); the other parameter is the
+        true one.
         """
         trace = self.trace([record])[0]
         return Estimate(q_mobile=float(trace.q_mobile[-1]), r_o=float(trace.r_o[-1]))
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]
-        """
-        One estimate for every step of many discharges.
-
-        :param records: simulated discharges of at least two samples
-        :return: one trace per discharge, in the same order; the other parameter is the true one
-        """
+        """One estimate for every step of simulated discharges of at least two samples; the other parameter is the true one."""
         traces = []
         for record in records:
             steps = len(record.time_s) - 1

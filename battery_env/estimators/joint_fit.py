@@ -107,7 +107,6 @@ def fit_cell(
     :param thermal: whether the temperature of the model moves. It starts at the measured one, if that is known
     :param dt_s: time step of the model, s
     :param limit_V: the largest root mean square of the residuals, V
-    :return: the fit
     :raises TypeError: for what is no sequence of records
     :raises ValueError: for an argument out of range, records that cannot be used or stay more than 0.05 V above the cut-off,
         or a cell that the equations cannot describe

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from battery_env.files import DamagedError, npz_path, read_npz, replacing, set_aside
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 _KIND = "state of an estimator"
 
 
@@ -29,7 +29,7 @@ def save_state(path: str | os.PathLike[str], settings: Mapping[str, Any], arrays
             warnings.warn(f"{error}. It is kept as {set_aside(target).name}, and a new one takes its place.", stacklevel=3)
         except ValueError as error:
             raise FileExistsError(f"{target} exists, and is no state of an estimator: choose another name") from error
-    metadata = json.dumps({"kind": _KIND, "format": FORMAT_VERSION, "settings": settings})
+    metadata = json.dumps({"kind": _KIND, "format": FORMAT_VERSION, "settings": settings, "sha256": _digest(arrays)})
     with replacing(target) as part:
         np.savez(part, metadata=np.array(metadata), **arrays)  # type: ignore[arg-type]  # none is named allow_pickle
     return target
@@ -50,31 +50,20 @@ def load_state(path: str | os.PathLike[str], settings: Mapping[str, Any]) -> dic
             f"{path} is of an estimator with {name} = {saved.get(name)!r}, this one has {own.get(name)!r}: make one with the "
             f"same arguments (different: {', '.join(different)})"
         )
+    # compiled code takes them as they are
+    if metadata["sha256"] != _digest(arrays):
+        raise ValueError(f"{path} is damaged: its arrays are not those that were saved")
     return arrays
 
 
-@contextmanager
-def refusing(name: str | os.PathLike[str]) -> Iterator[None]:
-    """Say of what is refused where it comes from."""
-    try:
-        yield
-    except ValueError as error:
-        raise error if str(name) in str(error) else ValueError(f"{name}: {error}") from error
-
-
-def check_like(arrays: Mapping[str, NDArray[Any]], like: Mapping[str, NDArray[Any]], growing: str = "") -> None:
-    """Refuse arrays of other names, kinds and shapes than those that an estimator has itself; one may have grown."""
-    if wrong := arrays.keys() ^ like.keys():
-        raise ValueError(f"arrays that are missing or unknown: {', '.join(sorted(wrong))}")
-    for name, own in like.items():
-        found, axes = arrays[name], own.ndim - (name == growing)
-        is_kind = found.dtype == own.dtype or (own.dtype.names is None and found.dtype.kind == own.dtype.kind)
-        if not is_kind or found.ndim != own.ndim or found.shape[:axes] != own.shape[:axes]:
-            raise ValueError(f"{name} is {found.dtype} of shape {found.shape}, and not {own.dtype} of {own.shape}")
-
-
-def check_all(**conditions: Any) -> None:
-    """Refuse contents of which one of these conditions, named after what it is about, does not hold for all."""
-    for name, holds in conditions.items():
-        if not all(np.all(each) for each in (holds if isinstance(holds, list) else [holds])):
-            raise ValueError(f"its {name} is none that a discharge leads to")
+def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Of the names, types, shapes and contents of arrays; between the fields of records lies what nobody wrote."""
+    digest, parts = sha256(), sorted(arrays.items())
+    while parts:
+        name, array = parts.pop()
+        if array.dtype.names:
+            parts += [(f"{name}.{field}", array[field]) for field in array.dtype.names]
+        else:
+            digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+            digest.update(array.tobytes())
+    return digest.hexdigest()

@@ -126,17 +126,11 @@ class _Seen(NamedTuple):
 
 
 class Ahead(NamedTuple):
-    """
-    What is asked of the time after a record.
+    """What is asked of the time after a record."""
 
-    :param load: the load to come; ``None``: as the settings say
-    :param samples: of what may come
-    :param is_asked: whether an end that cannot be told is an error, and not only unknown
-    """
-
-    load: LoadToCome | None = None
-    samples: int = 1000
-    is_asked: bool = False
+    load: LoadToCome | None = None  # to come; ``None``: as the settings say
+    samples: int = 1000  # of what may come
+    is_asked: bool = False  # whether an end that cannot be told is an error, and not only unknown
 
 
 _GOES_ON = Ahead()

@@ -1,15 +1,6 @@
 """
 The command line: what records of discharges say about their cells, when one in progress ends, how constants are found, and a
 page that shows all of it.
-
-.. code-block:: bash
-
-  python -m battery_env calibrate discharge.csv
-  python -m battery_env calibrate B0005:12 --out results/B0005
-  battery-calibrate lab/ --out results --jobs 2
-  battery-calibrate forecast running.csv --life lab/ --load profile.csv
-  battery-calibrate page
-  python -m battery_env fit B0005:1 B0005:84 B0005:168 --out my_cell.json
 """
 
 from __future__ import annotations

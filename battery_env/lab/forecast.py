@@ -108,11 +108,7 @@ class Forecast:
         return quantile(self.eod_time_s, probability)
 
     def summary(self) -> str:
-        """
-        The forecast in a readable form.
-
-        :return: a text of several lines
-        """
+        """The forecast in a readable form."""
         q_max_Ah, r_o_mohm = self.q_mobile / 3600.0, 1e3 * self.r_o
         rows = {
             "end of discharge (s)": (self.eod_time_s, 0),
@@ -135,11 +131,7 @@ class Forecast:
         return "\n".join([*lines, *self.notes])
 
     def plot(self) -> Figure:
-        """
-        The voltage of the record and the one to expect, with the interval of the end of discharge.
-
-        :return: the figure
-        """
+        """The voltage of the record and the one to expect, with the interval of the end of discharge."""
         from battery_env.plotting import draw_end, new_figure  # here, as matplotlib takes long to import
 
         figure = new_figure(6.4, 3.6)

@@ -180,7 +180,6 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     :param discharges: of one cell, in their order
     :param cut_off_V: where they end, V
     :param calibrator: without a prior; ``None``: ``LeastSquares(thermal=True, mismatch_V=0.05)``
-    :return: the cell's life so far
     :raises ValueError: if no discharge is valid, or the calibrator has a prior or no full cell at the start
     """
     calibrator = LeastSquares(thermal=True, mismatch_V=0.05) if calibrator is None else calibrator

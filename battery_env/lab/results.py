@@ -68,14 +68,9 @@ class Outcome:
 
 class Results:
     """
-    The files that results are written to. A row of the run is appended as each discharge is done, and whatever ends the
-    command, the same one goes on from there. Other results that are there are refused unless they may be replaced.
-
-    :param folder: of all files
-    :param sources: what is looked at
-    :param with_voltages: whether the voltages of single discharges are written
-    :param settings: of the calibration
-    :param made_with: what else the rows depend on
+    The files in a folder that results are written to. A row of the run is appended as each discharge is done, and whatever
+    ends the command, the same one goes on from there: one with the same sources, settings and whatever else its rows are made
+    with. Other results that are there are refused unless they may be replaced.
     """
 
     def __init__(

@@ -122,7 +122,6 @@ def forecast_end(
     :param load: from the last sample under load on, as :func:`battery_env.forecast` takes it; ``None``: as so far
     :param samples: of what may come
     :param life: of the cell before, whose prior is taken that suits the load; ``None``: that of the settings, if any
-    :return: these
     :raises ValueError: if the discharge cannot be used, or a load cannot be meant
     """
     settings = Settings() if settings is None else settings
@@ -135,12 +134,9 @@ def forecast_end(
 
 def read_load(path: str | Path) -> Load:
     """
-    Read a load to come: text with the columns ``time_s``, from 0 on, and ``current_A`` or ``power_W``, positive in discharge.
-    Each value holds until the next time, and the last one for ever.
-
-    :param path: the file, with commas, semicolons or tabs
-    :return: the load
-    :raises ValueError: if the file holds none
+    Read a load to come: text, with commas, semicolons or tabs, of the columns ``time_s``, from 0 on, and ``current_A`` or
+    ``power_W``, positive in discharge. Each value holds until the next time, and the last one for ever. A ``ValueError`` if a
+    file holds none.
     """
     try:
         table = pd.read_csv(path, sep=None, engine="python", encoding="utf-8-sig", compression=None)

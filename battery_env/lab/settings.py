@@ -29,9 +29,8 @@ METHODS: tuple[Method, ...] = get_args(Method)
 # estimate within this ratio.
 _SAME_LOAD = 1.25
 _AMBIENT_LIMITS_C = (-60.0, 100.0)
-# Policies that come with the package, by what they find.
-_PRETRAINED = {"q_mobile": "BatteryVoltageQmax-v0", "r_o": "BatteryVoltageRo-v0"}
-_PRETRAINED_JOINT = "BatteryVoltageJoint-v0"
+# Policies that come with the package, by what they find alone.
+_PRETRAINED: dict[tuple[str, ...], str] = {("q_mobile",): "BatteryVoltageQmax-v0", ("r_o",): "BatteryVoltageRo-v0"}
 # What a policy cannot be told: it has learned on one model.
 _NOT_FOR_POLICIES = ("prior_q_mobile_C", "mismatch_V", "current_gain_sd", "ambient_C", "q_mobile_bounds_C", "initial_soc")
 
@@ -134,7 +133,6 @@ class Settings:
 
         :param cell: what ``fit_cell`` found; of cells of its kind what ``fit_life`` found; or the constants alone
         :param others: further settings, which replace what the fit knows
-        :return: the settings
         """
         if isinstance(cell, CellFit):
             known: dict[str, Any] = {"cut_off_V": cell.cell.VEOD}
@@ -176,7 +174,6 @@ class Settings:
 
         :param cell: constants of the model at the temperature of a discharge; ``None``: those of the settings
         :param start: how the discharge starts; ``None``: as the settings say
-        :return: the calibrator
         :raises ValueError: for an option out of range, or a policy of another cell or of other parameters
         """
         if self.method == "policy":
@@ -198,8 +195,7 @@ class Settings:
 
     def _policy(self) -> PolicyEstimator:
         if self.policy is None:
-            names = check_parameters(self.parameters)
-            env_id = _PRETRAINED_JOINT if len(names) > 1 else _PRETRAINED[names[0]]
+            env_id = _PRETRAINED.get(check_parameters(self.parameters), "BatteryVoltageJoint-v0")
             return PolicyEstimator.pretrained(env_id, recorded=True)
         policy, options = policy_of_file(self.policy)
         if options.get("cell") != self.cell:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib import import_module
-from math import inf, isnan, nan
+from math import isnan, nan
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -20,15 +20,12 @@ from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.estimates import last_estimate
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
-from battery_env.estimators.state_files import check_all, check_like
-from battery_env.parameters import PARAMETERS
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
-from battery_env.policies.readings import ReadingsSoFar
+from battery_env.policies.readings import columns, on_grid, with_voltage
 from battery_env.records import (
     Samples,
     Shown,
-    are_plausible,
     check_drawn_charge,
     check_record,
     check_sample,
@@ -44,8 +41,6 @@ from battery_env.tasks.voltage.task import VoltageTask
 
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
-# No number that a fit finds comes near, C, ohm or V.
-_LARGEST = 1e9
 
 
 class Predictor(Protocol):
@@ -136,7 +131,6 @@ class PolicyEstimator(OnlineEstimator):
         :param recorded: whether for recorded cells: of both parameters one that has learned along the lives of the bundled
             cells, of one of them one that has learned on a model whose error wanders. By default one that has learned on a
             model with wrong constants, as simulated cells have
-        :return: the estimator
         :raises ValueError: for another id, or a time out of range
         :raises ImportError: without the extra ``battery_env[onnx]``
         """
@@ -145,14 +139,7 @@ class PolicyEstimator(OnlineEstimator):
 
     @staticmethod
     def environment(env_id: str, **options: Any) -> CalibrationEnv:
-        """
-        A calibration environment without its wrappers.
-
-        :param env_id: id of a calibration environment
-        :param options: of the environment
-        :return: the environment
-        :raises ValueError: if it is none
-        """
+        """A calibration environment, by its id and options, without its wrappers; a ``ValueError`` if it is none."""
         env = gym.make(env_id, disable_env_checker=True, **options).unwrapped
         if not isinstance(env, CalibrationEnv):
             raise ValueError(f"{env_id} is no calibration environment")
@@ -162,7 +149,7 @@ class PolicyEstimator(OnlineEstimator):
         """
         Forget all samples: the next one is the first of a discharge, of a fully charged cell at rest.
         """
-        self._readings = ReadingsSoFar()
+        self._samples: list[tuple[float, float, float]] = []
         self._drawn_C = 0.0
         self._decisions = 0
         self._now = np.array([self.cell.q_mobile, self.cell.r_o])
@@ -176,7 +163,7 @@ class PolicyEstimator(OnlineEstimator):
         self._sd, self._found = [nan, nan], None
         self._verdict = Verdict(False, False, (Condition.NO_FIT if self._confidence is None else Condition.NOT_YET).text)
         if self._confidence is not None and self._fitted is not None:
-            samples = self._readings.known(self._decisions * self.decision_s)
+            samples = with_voltage(self._samples, self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
             self._verdict = self._confidence.verdict(self._fitted, 0, self._now, samples, Shown())
             self._found = self._confidence.constants(self._fitted, 0)
@@ -189,10 +176,10 @@ class PolicyEstimator(OnlineEstimator):
             raise ValueError(f"a policy of {self.env_id} takes no stream: it needs the full state, or a whole life")
         if temperature_C is not None:
             raise ValueError("a policy takes no temperature: its model is isothermal. Leave temperature_C out.")
-        if not self._readings.time_s:
+        if not self._samples:
             check_sample(voltage_V, current_A, dt_s)
             return
-        before_A = self._readings.current_A[-1]
+        _, _, before_A = self._samples[-1]
         check_sample(voltage_V, current_A, dt_s, previous_A=before_A)
         check_drawn_charge(self._drawn_C + dt_s * before_A, -SURPLUS_SHARE * self.cell.q_mobile)
 
@@ -208,12 +195,15 @@ class PolicyEstimator(OnlineEstimator):
         :raises ValueError: for invalid values, a temperature, or a policy that takes no stream
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
-        readings = self._readings
-        if readings.time_s:
-            self._drawn_C += dt_s * readings.current_A[-1]
-        readings.add(voltage_V, current_A, dt_s)
-        due = int(readings.time_s[-1] / self.decision_s + 1e-9)
-        if due > self._decisions and self._readings.are_two(due * self.decision_s):
+        time_s = 0.0
+        if self._samples:
+            before_s, _, before_A = self._samples[-1]
+            time_s = before_s + dt_s
+            self._drawn_C += dt_s * before_A
+        self._samples.append((time_s, float(voltage_V), float(current_A)))
+        due = int(time_s / self.decision_s + 1e-9)
+        # two beside the first one
+        if due > self._decisions and len(with_voltage(self._samples, due * self.decision_s).time_s) > 2:
             self._decide(due)
         (q_mobile, r_o), (sd_q_mobile, sd_r_o), (settled_q, settled_r_o, reason) = self._now.tolist(), self._sd, self._verdict
         both = settled_q and settled_r_o
@@ -226,7 +216,7 @@ class PolicyEstimator(OnlineEstimator):
 
     def _decide(self, due: int) -> None:
         """One decision, on all readings up to the time when it was due."""
-        task = self._follow([self._readings.record(self.dt_s)], due * self.decision_s)
+        task = self._follow([on_grid(self._samples, self.dt_s)], due * self.decision_s)
         assert isinstance(task, VoltageTask)  # no other follows a stream
         task.restore(self._now, self._action, self._constants)
         self._constants = task.constants[0]
@@ -241,8 +231,8 @@ class PolicyEstimator(OnlineEstimator):
         model = RecordModel(cell_with(self.cell, self._found), dt_s=self.dt_s)
         q_mobile, r_o = self._now.tolist()
         state = model.start(q_mobile)
-        if self._readings.time_s and self._readings.time_s[-1] > 0.0:
-            state = model.simulate(self._readings.record(self.dt_s).current_A, q_mobile, r_o).state[-1]
+        if self._samples and self._samples[-1][0] > 0.0:
+            state = model.simulate(on_grid(self._samples, self.dt_s).current_A, q_mobile, r_o).state[-1]
         return ModelNow(model.cell, False, self.dt_s, state, np.append(self._now, 0.0), np.zeros((0, STATE_SIZE + 3)))
 
     def _made_with(self) -> dict[str, Any]:
@@ -259,38 +249,14 @@ class PolicyEstimator(OnlineEstimator):
         progress = np.array([self._drawn_C, self._decisions, *self._now])
         fitted = {} if self._fitted is None else {f"fitted_{name}": each for name, each in self._fitted._asdict().items()}
         return fitted | {
-            "samples": self._readings.columns(),
+            "samples": columns(self._samples),
             "progress": progress,
             "action": self._action,
             "constants": self._constants,
         }
 
-    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
-        fit = {} if "fitted_readings" not in arrays else {f"fitted_{name}": np.zeros(1) for name in Fitted._fields}
-        fit |= {name: np.zeros((1, 2)) for name in ("fitted_estimate", "fitted_sd", "fitted_sd_alone") if fit}
-        fit |= {"fitted_constants": self._no_constants[None]} if fit else {}
-        fit |= {"fitted_readings": np.zeros(1, np.int64)} if fit else {}
-        own = {name: array for name, array in self._arrays().items() if not name.startswith("fitted_")}
-        check_like(arrays, own | fit, growing="samples")
-        time_s, voltage_V, current_A = arrays["samples"]
-        first, drawn_C, decisions = np.arange(len(time_s)) == 0, *arrays["progress"][:2]
-        step_s, before_A = np.diff(time_s, prepend=-1.0), np.append(0.0, current_A[:-1])[: len(time_s)]
-        low, high = np.transpose([parameter.limits for parameter in PARAMETERS.values()])
-        check_all(
-            sample=are_plausible(voltage_V, current_A, np.where(first, 1.0, step_s), None, before_A),
-            start=~first | ((time_s == 0.0) & ~np.isnan(voltage_V)),
-            charge=np.isfinite(drawn_C),
-            fit=[(np.abs(arrays[each]) < _LARGEST) | ((arrays[each] == inf) & (each == "fitted_white_V")) for each in fit],
-            spread=[arrays[each] >= 0.0 for each in fit if each.endswith(("sd", "sd_alone", "_noise_V", "white_V"))],
-            readings=[arrays[each] > 0 for each in fit if each == "fitted_readings"],
-            estimate=(arrays["progress"][2:] >= low) & (arrays["progress"][2:] <= high),
-            action=np.abs(arrays["action"]) <= 1.0,
-            constants=np.isfinite(arrays["constants"]),
-        )
-        check_all(count=decisions in range(int(max(time_s, default=0.0) / self.decision_s + 1e-9) + 1))
-
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        self._readings = ReadingsSoFar.of(arrays["samples"])
+        self._samples = list(map(tuple, arrays["samples"].T.tolist()))
         self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
         self._now, self._action = arrays["progress"][2:].copy(), arrays["action"].copy()
         self._constants = arrays["constants"].copy()
@@ -304,23 +270,18 @@ class PolicyEstimator(OnlineEstimator):
         independent of each other, the mean.
 
         :param record: one discharge; with the full state a simulated one, as no recording has it
-        :return: the estimate
         :raises ValueError: for an invalid record
         """
         check_drawn_charge(drawn_charge_C(check_record(record)))
         trace = self.trace([record])[0]
         if trace.sd_q_mobile is not None:
             return last_estimate(trace)
-        q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
+        first = 0 if self.task_class.is_averaged else -1
+        q_mobile, r_o = (float(values[first:].mean()) for values in (trace.q_mobile, trace.r_o))
         return Estimate(q_mobile, r_o, settled=False, reason=Condition.NO_FIT.text)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
-        """
-        The estimates over time of many discharges.
-
-        :param records: discharges; a :class:`~battery_env.trajectories.TrajectoryDataset` is such a sequence
-        :return: one trace per discharge, in the same order
-        """
+        """The estimates over time of many discharges, run as one batch, in their order."""
         task = self._follow(records, self.decision_s)
         samples = [] if self._confidence is None else [(Samples.of(record), shown_beside(record)) for record in records]
         made: list[FloatArray] = []

@@ -1,8 +1,4 @@
-"""
-Recorded discharges of real cells, and their files.
-
-Two 18650 cells of NASA's battery data set come with the package: ``load_nasa_discharges("B0005")``, ``"B0006"``.
-"""
+"""Recorded discharges of real cells, and NASA's files of them."""
 
 from __future__ import annotations
 
@@ -337,11 +333,7 @@ class Discharge:
 
     def until(self, time_s: float) -> Discharge:
         """
-        What had been recorded by some moment.
-
-        :param time_s: that moment, on the clock of the record, s
-        :return: the samples up to then
-        :raises ValueError: if these are too few
+        The samples that had been recorded by some moment on the clock of the record, s; a ``ValueError`` if these are too few.
         """
         if not isinstance(time_s, Real) or np.isnan(time_s):
             raise ValueError(f"time_s must be a time in s, got {time_s!r}")

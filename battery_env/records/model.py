@@ -57,12 +57,7 @@ class VoltageForecast:
     at_samples_V: FloatArray
 
     def reached_s(self, voltage_V: float) -> float:
-        """
-        When the voltage falls to a level.
-
-        :param voltage_V: the level, V
-        :return: on the clock of the record, s; NaN if it is not reached
-        """
+        """When the voltage falls to a level, V, on the clock of the record, s; NaN if it is not reached."""
         return self.simulation.reached_s(voltage_V)
 
     @property
@@ -156,12 +151,7 @@ class RecordModel:
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
 
     def of_cell(self, cell: CellParameters) -> RecordModel:
-        """
-        The same with other constants.
-
-        :param cell: constants of the model, at the temperature of these
-        :return: the model, with the same start
-        """
+        """The same model, with the same start, of other constants at the same temperature."""
         model = copy(self)
         model.cell, model._derivatives = check_cell(cell, self.thermal), PolynomialDerivatives.of(cell.packed)
         check_dt(self.dt_s, cell)
@@ -182,10 +172,8 @@ class RecordModel:
 
     def start(self, q_mobile: float | FloatArray) -> FloatArray:
         """
-        The state at the first sample of a cell with the history that ``initial`` stands for, or at rest with ``initial_soc``.
-
-        :param q_mobile: charge that can move, C, shape (...)
-        :return: shape (..., 8)
+        The state at the first sample, shape (..., 8), of cells with some ``q_mobile``, C, shape (...), and the history that
+        ``initial`` stands for, or at rest with ``initial_soc``.
         """
         missing_C = np.asarray(q_mobile - _Q_PER_CHARGE * self.initial[QNB:].sum())
         start = np.broadcast_to(self.initial, (*missing_C.shape, STATE_SIZE)).copy()
@@ -244,7 +232,6 @@ class RecordModel:
         :param future_current_A: current beyond the end of the record, at least 0 A; ``None``: as
             :func:`~battery_env.records.expected_current` has it, the last current of a constant load and the mean of a load
             that varied, which is an assumption
-        :return: the voltage, and when the cut-off is reached
         :raises ValueError: for a negative future current, parameters out of range, or a record that cannot be used
         """
         Q_MOBILE.check(at.q_mobile)
@@ -301,13 +288,8 @@ class RecordModel:
 
     def tangents(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Tangents:
         """
-        The voltage under a current and its derivatives with respect to both parameters and the constants that say how fast the
-        cell follows its load; unchecked.
-
-        :param current_A: current over each step, A, shape (K,)
-        :param q_mobile: charge that can move, C
-        :param r_o: ohmic resistance, ohm
-        :return: voltage and derivatives
+        As :meth:`sensitivities`, with the derivatives by the logarithms of the constants that say how fast the cell follows
+        its load; unchecked.
         """
         columns = np.full((len(TANGENT_NAMES) + 2, len(current_A)), np.nan)
         self._roll_out(current_A, q_mobile, r_o, 1, columns)
@@ -329,21 +311,13 @@ class RecordModel:
 
     def least_q_mobile_C(self, current_A: FloatArray) -> float:
         """
-        The ``q_mobile`` below which the model cell is empty before a current ends. At a fixed current its charges are linear
-        in ``q_mobile``, so that one roll-out gives it exactly.
-
-        :param current_A: current over each step, A, shape (K,)
-        :return: C
+        The ``q_mobile`` below which the model cell is empty before a current over each step, A, ends, C. At a fixed current
+        its charges are linear in ``q_mobile``, so that one roll-out gives it exactly.
         """
         return self.least_q_mobile_tangent_C(current_A)[0]
 
     def least_q_mobile_tangent_C(self, current_A: FloatArray) -> tuple[float, float]:
-        """
-        The same and its derivative with respect to the logarithm of ``tDiffusion``, the only other constant it depends on.
-
-        :param current_A: current over each step, A, shape (K,)
-        :return: both, C
-        """
+        """The same and its derivative by the logarithm of ``tDiffusion``, the only other constant it depends on, both in C."""
         q_C = Q_MOBILE.limits[1]
         constants = self.cell.packed.constants
         least_C, by_t_C = least_q_mobile(current_A, q_C, self.dt_s, constants, self.start(q_C), self._shares)

@@ -68,13 +68,7 @@ class Record(Protocol):
 
 
 class Samples(NamedTuple):
-    """
-    Samples of a record, which are a record themselves; arrays of shape (T,).
-
-    :param time_s: s
-    :param voltage_V: V
-    :param current_A: positive in discharge, A
-    """
+    """Samples of a record, which are a record themselves: s, V, and A, positive in discharge; arrays of shape (T,)."""
 
     time_s: FloatArray
     voltage_V: FloatArray
@@ -336,17 +330,11 @@ class Stream(NamedTuple):
 
 
 class ExpectedCurrent(NamedTuple):
-    """
-    The current to expect after the end of a record.
+    """The current to expect after the end of a record, A."""
 
-    :param mean_A: its mean, A; 0 if the load was switched off and not on again
-    :param varied: whether the load varied, so that ``mean_A`` is the mean of the last half of it and an assumption
-    :param sd_A: how far means over quarters of the record lie from each other (standard deviation), A
-    """
-
-    mean_A: float
-    varied: bool
-    sd_A: float
+    mean_A: float  # 0 if the load was switched off and not on again
+    varied: bool  # whether the load did, so that the mean is that of its last half, and an assumption
+    sd_A: float  # how far means over quarters of the record lie from each other
 
 
 def expected_current(time_s: ArrayLike, current_A: ArrayLike) -> ExpectedCurrent:

@@ -16,17 +16,11 @@ _READ_SHARE = 0.005
 
 
 class ChargeBefore(NamedTuple):
-    """
-    The charge that ended before a discharge.
+    """The charge that ended before a discharge."""
 
-    :param highest_V: the highest voltage, V; the cell rests below it
-    :param last_A: the current, without a sign, at which that voltage was held last, A
-    :param largest_A: the largest current, without a sign, A
-    """
-
-    highest_V: float
-    last_A: float
-    largest_A: float
+    highest_V: float  # the cell rests below it
+    last_A: float  # the current, without a sign, at which that voltage was held last
+    largest_A: float  # without a sign
 
     @classmethod
     def of(cls, voltage_V: FloatArray, current_A: FloatArray) -> ChargeBefore:
@@ -45,28 +39,18 @@ class ChargeBefore(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """
-    What a record shows beside its samples, which calibrators take in.
+    """What a record shows beside its samples, which calibrators take in."""
 
-    :param at_rest: whether the first voltage is that of the cell at rest, though the first current may be that of the load
-        that was switched on then
-    :param rest_s: how long the cell rested before the load, s
-    :param charge: the charge before; ``None``: not recorded
-    :param load_on_s: when the load came on, as the tester says, on the clock of the record, s; ``None``: it does not
-    :param load_on_C: standard deviation of the charge by the moment of load-on, which lies between two samples, C
-    :param offset_A: what flows at rest, A
-    :param is_counted: whether the tester counted the charge
-    :param uncounted_C: by how much the charge is another one than the tester counted or, without a count, what a clock that
-        starts anew with each step does not tell, C
-    """
-
+    # whether the first voltage is that of rest, though the first current may be that of a load switched on then
     at_rest: bool = False
-    rest_s: float = 0.0
-    charge: ChargeBefore | None = None
+    rest_s: float = 0.0  # how long the cell rested before the load
+    charge: ChargeBefore | None = None  # the one before; ``None``: not recorded
+    # when the load came on, as the tester says, on the clock of the record; ``None``: it does not
     load_on_s: float | None = None
-    load_on_C: float = 0.0
-    offset_A: float = 0.0
-    is_counted: bool = False
+    load_on_C: float = 0.0  # sd of the charge by the moment of load-on, which lies between two samples
+    offset_A: float = 0.0  # what flows at rest
+    is_counted: bool = False  # whether the tester counted the charge
+    # by how much it counted another charge or, without a count, what a clock of each step does not tell
     uncounted_C: float = 0.0
 
 

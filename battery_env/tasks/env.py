@@ -126,9 +126,8 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def render(self) -> NDArray[np.uint8] | None:
         """
-        A picture of the episode so far: voltage and parameters, of the cell and of the model.
-
-        :return: shape (height, width, 3), or ``None`` without a render mode
+        A picture of the episode so far, of the cell and of the model, shape (height, width, 3), or ``None`` without a render
+        mode.
         """
         if self.render_mode is None:
             return None

@@ -58,6 +58,9 @@ class CalibrationTask(ABC):
     #: what :meth:`report` returns
     REPORTED: ClassVar[tuple[str, ...]] = ("q_mobile", "r_o", "q_mobile_hat", "r_o_hat", "voltage", "voltage_hat", "soc")
 
+    #: whether estimates are independent of each other, so that the mean of those over a record counts, and not the last one
+    is_averaged: ClassVar[bool]
+
     parameters: tuple[Literal["q_mobile", "r_o"], ...]
     cells: int
     dataset: Sequence[Record]
@@ -72,11 +75,7 @@ class CalibrationTask(ABC):
 
     @classmethod
     def options(cls) -> dict[str, Any]:
-        """
-        What the task can be asked for; its page says what each option means.
-
-        :return: default values by name
-        """
+        """What the task can be asked for, default values by name; its page says what each option means."""
         arguments = inspect.signature(cls).parameters.values()
         return {argument.name: argument.default for argument in arguments if argument.kind is argument.KEYWORD_ONLY}
 
@@ -105,11 +104,7 @@ class CalibrationTask(ABC):
 
     @abstractmethod
     def observation(self) -> NDArray[np.float32]:
-        """
-        What the agent sees.
-
-        :return: shape (cells, observation_size), within ``OBSERVATION_LIMIT``; a new array each time
-        """
+        """What the agent sees: a new array of shape (cells, observation_size), within ``OBSERVATION_LIMIT``."""
 
     @abstractmethod
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
@@ -125,9 +120,8 @@ class CalibrationTask(ABC):
     @abstractmethod
     def truncated(self) -> NDArray[np.bool_]:
         """
-        Whose episode is over, as its steps or its data have come to an end. No episode terminates.
-
-        :return: shape (cells,); a new array each time
+        Whose episode is over, as its steps or its data have come to an end: a new array of shape (cells,). No episode
+        terminates.
         """
 
     @classmethod
@@ -146,27 +140,12 @@ class CalibrationTask(ABC):
     @abstractmethod
     def seen(self) -> tuple[IntArray, FloatArray]:
         """
-        Which data the next decision knows.
-
-        :return: each cell's discharge, and the time of its last sample, s, shape (cells,); new arrays
-        """
-
-    @staticmethod
-    @abstractmethod
-    def conclude(estimates: FloatArray) -> float:
-        """
-        What is left of the estimates over a record.
-
-        :param estimates: of one parameter, one per decision, shape (K,)
-        :return: one estimate
+        Which data the next decision knows: each cell's discharge, and the time of its last sample, s, new arrays of shape
+        (cells,).
         """
 
     def fitted(self) -> Fitted | None:
-        """
-        What the fit in the observation says (options ``nuisance`` and ``path``).
-
-        :return: of each cell; ``None`` if there is none
-        """
+        """What the fit in the observation says of each cell (options ``nuisance`` and ``path``), if there is one."""
         return None
 
     def drop_ended(self) -> None:  # noqa: B027 (a task may go on with all cells)

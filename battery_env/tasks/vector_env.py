@@ -127,9 +127,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """
-        A picture of the episode so far of every cell, as the scalar environment draws it.
-
-        :return: arrays of shape (height, width, 3), or ``None`` without a render mode
+        Pictures of the episodes so far of every cell, as the scalar environment draws them, or ``None`` without a render mode.
         """
         if self.render_mode is None:
             return None

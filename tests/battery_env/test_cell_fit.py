@@ -256,7 +256,7 @@ class TestRealCells:
         assert b0005_fit.doubt == "" and "a full cell rests at 4.19 V before, at 4.20 V after" in b0005_fit.summary()
         assert [discharge.name for discharge in b0005_fit.discharges] == ["B0005:1", "B0005:85", "B0005:168"]
         assert "B0005:85" in b0005_fit.summary()
-        assert len(b0005_fit.constants_table()) == len(RATE_PRIOR_SD) + len(EQUILIBRIUM_PRIOR_SD_V)
+        assert len(b0005_fit.constants) == len(RATE_PRIOR_SD) + len(EQUILIBRIUM_PRIOR_SD_V)
 
 
 class TestFiles:

@@ -1,5 +1,3 @@
 """What speaks against an estimate: a table of conditions, and the evidence of samples, gaps and the rest before a load."""
 
-from battery_env.estimators.diagnosis.conditions import Condition
-
-__all__ = ["Condition"]
+from battery_env.estimators.diagnosis.conditions import Condition as Condition

@@ -241,14 +241,7 @@ class Verdict(NamedTuple):
 
     @classmethod
     def of(cls, first: Sequence[int], r_o_comes_first: bool, said: Callable[[Condition], str]) -> Verdict:
-        """
-        What follows from the first condition against each number.
-
-        :param first: these, ``SETTLED`` where there is none
-        :param r_o_comes_first: whether ``r_o`` is the larger doubt
-        :param said: the text of a condition
-        :return: the verdict
-        """
+        """What follows from the first condition against each number, ``SETTLED`` where there is none."""
         rows = [
             number for number in dict.fromkeys(reversed(first) if r_o_comes_first else first) if number != Condition.SETTLED
         ]
@@ -269,11 +262,8 @@ class Diagnosis:
 
     def verdict(self, values: Mapping[str, float], sds: Mapping[str, float]) -> Verdict:
         """
-        Which numbers are settled, and why not both: first why not the one that is farther beyond its limit.
-
-        :param values: of the numbers, as the record alone has them
-        :param sds: their standard deviations, likewise
-        :return: the verdict
+        Which numbers are settled, by their values and standard deviations as the record alone has them, and why not both:
+        first why not the one that is farther beyond its limit.
         """
         noted = [[row for row in self.measured if name in row.against] for name in PARAMETER_NAMES]
         first = [min(rows, default=Condition.SETTLED) for rows in noted]

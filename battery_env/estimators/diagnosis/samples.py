@@ -127,15 +127,8 @@ def watched(
     model_V: FloatArray | None = None,
 ) -> Any:
     """
-    What the samples of a whole record show, beside an estimate.
-
-    :param record: its samples
-    :param cell: constants of the model
-    :param initial_soc: state of charge at the start; ``None``: no rest is expected
-    :param estimate: ``q_mobile``, C, and ``r_o``, ohm
-    :param shown: what is known beside the samples
-    :param model_V: voltage of the model at the samples, V; ``None``: gaps are not looked at
-    :return: a row of ``SEEN``
+    What the samples of a whole record show beside an estimate of ``q_mobile``, C, and ``r_o``, ohm, a row of ``SEEN``. Without
+    a state of charge no rest is expected at the start; without the voltage of the model gaps are not looked at.
     """
     seen = np.zeros(1, SEEN)
     expect(seen, cell, initial_soc)
@@ -149,14 +142,8 @@ def note_samples(
     diagnosis: Diagnosis, seen: Any, initial_soc: float, record: Samples, shown: Shown, unsettled_sd_C: float = inf
 ) -> None:
     """
-    Note what the start of a record and its sensors say against an estimate.
-
-    :param diagnosis: of the estimate
-    :param seen: what :func:`watched` saw
-    :param initial_soc: state of charge that was expected at the start
-    :param record: the samples
-    :param shown: what is known beside them
-    :param unsettled_sd_C: standard deviation of a ``q_mobile`` that is not settled, C
+    Note what the start of a record and its sensors, as :func:`watched` saw them, say against an estimate; of a ``q_mobile``
+    that is not settled with its standard deviation, C.
     """
     said = measured(seen, initial_soc, float(record.time_s[0]), shown.charge)
     smeared = is_smeared(seen) * Condition.R_SWITCHES

@@ -1,5 +1,4 @@
 """The extended Kalman filter: filter.py is what users call, bank.py its filters, and state.py what they remember."""
 
-from battery_env.estimators.kalman.filter import ExtendedKalmanFilter, KalmanBatch
-
-__all__ = ["ExtendedKalmanFilter", "KalmanBatch"]
+from battery_env.estimators.kalman.filter import ExtendedKalmanFilter as ExtendedKalmanFilter
+from battery_env.estimators.kalman.filter import KalmanBatch as KalmanBatch

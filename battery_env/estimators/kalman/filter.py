@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from math import inf, isnan, nan
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers
+from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
@@ -20,10 +22,10 @@ from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.diagnosis.rest import check_initial_soc
 from battery_env.estimators.diagnosis.samples import begin, belongs, examine, expect, measured, remember, take_in
-from battery_env.estimators.estimator import ModelNow, OnlineBatch, OnlineEstimator, check_bounds
+from battery_env.estimators.estimator import ModelNow, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
-from battery_env.estimators.state_files import check_all, check_like
+from battery_env.estimators.state_files import load_state, save_state
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import ChargeBefore, Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
@@ -31,9 +33,9 @@ _PRIOR_SD_SHARE_Q = 0.25
 # Of a new 18650; a resistance goes with one over the size.
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
+# So far may the parameters wander in an hour, as a share of their prior means: a little keeps a filter awake.
+_DRIFT_PER_HOUR = 0.001
 _NOISE_V = 0.005
-# Covariances of a state may be so much larger than their variances allow, as a share.
-_ROUNDED = 1e-6
 # What reasons are made of
 _SHOWN = "start rest fault switch switches gap start_V time_s uncounted_C dropped_C dropped_ohm".split()
 
@@ -111,8 +113,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :param offset_sd_V: standard deviation of a constant offset of sensor and model, V; ``None``: ``mismatch_V``, and at least
         0.005 V. With 0 errors are about half as large if there is no offset, and several percent if there is one of 10 mV
     :param mismatch_V: how far the error of the model itself wanders in an hour (standard deviation of a random walk), V
-    :param drift_per_hour: how far the parameters may wander in an hour, as a share of their prior means. A little keeps the
-        filter awake
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
     :param initial_soc: state of charge at the first sample, after a rest: a number, or (mean, standard deviation), which adds
         to that of ``q_mobile``
@@ -133,7 +133,6 @@ class ExtendedKalmanFilter(OnlineEstimator):
         voltage_noise_V: float | None = None,
         offset_sd_V: float | None = None,
         mismatch_V: float = 0.0,
-        drift_per_hour: float = 0.001,
         current_gain_sd: float = 0.0,
         initial_soc: float | tuple[float, float] = 1.0,
         cell_sd_r_o_ohm: float = 0.0,
@@ -144,10 +143,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self.dt_s = check_dt(dt_s, self.cell)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         offset_sd_V = max(_NOISE_V, mismatch_V) if offset_sd_V is None else offset_sd_V
-        check_not_negative(offset_sd_V=offset_sd_V, mismatch_V=mismatch_V, drift_per_hour=drift_per_hour)
+        check_not_negative(offset_sd_V=offset_sd_V, mismatch_V=mismatch_V, cell_sd_r_o_ohm=cell_sd_r_o_ohm)
         voltage_noise_V = _checked_noise_V(voltage_noise_V, mismatch_V)
         self.current_gain_sd = check_gain_sd(current_gain_sd)
-        check_not_negative(cell_sd_r_o_ohm=cell_sd_r_o_ohm)
         self.initial_soc = check_initial_soc(initial_soc)
         q, q_sd = self._prior("q_mobile", prior_q_mobile_C, _PRIOR_SD_SHARE_Q * self.cell.q_mobile)
         r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM * NEW_CELL.q_mobile / self.cell.q_mobile)
@@ -161,8 +159,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
             searched=("q_mobile" in self.parameters, "r_o" in self.parameters),
             variance=(q_sd**2, r_o_sd**2),
             growth=(
-                (drift_per_hour * q) ** 2 / _HOUR_S if q_sd > 0.0 else 0.0,
-                (drift_per_hour * r_o) ** 2 / _HOUR_S if r_o_sd > 0.0 else 0.0,
+                (_DRIFT_PER_HOUR * q) ** 2 / _HOUR_S if q_sd > 0.0 else 0.0,
+                (_DRIFT_PER_HOUR * r_o) ** 2 / _HOUR_S if r_o_sd > 0.0 else 0.0,
             ),
             offset_growth=float(mismatch_V) ** 2 / _HOUR_S,
             bounds=(_pair(q_mobile_bounds_C), _pair(r_o_bounds_ohm)),
@@ -324,49 +322,33 @@ class ExtendedKalmanFilter(OnlineEstimator):
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {"cells": self._cells, "filters": self._filters}
 
-    def _check_state(self, arrays: dict[str, NDArray[Any]]) -> None:
-        check_like(arrays, self._arrays())
-        (cell,), seen = arrays["cells"], arrays["cells"]["seen"]
-        filters = arrays["filters"][arrays["filters"]["log_weight"] > -inf]  # the others were given up
-        covariance, (low, high) = filters["covariance"], np.transpose(list(self.bounds.values()))
-        variance = np.diagonal(covariance, axis1=1, axis2=2)
-        most = np.sqrt(np.abs(variance[:, :, None] * variance[:, None, :]))
-        counts = (seen["samples"], seen["examined"]["count"], seen["ring"]["n_kept"], seen["ring"]["n_changes"])
-        check_all(
-            log_weight=np.append(np.isfinite(filters["log_weight"]), len(filters) > 0),
-            state=np.isfinite(filters["state"]),
-            tangents=np.isfinite(filters["tangents"]),
-            mean=np.isfinite(filters["mean"]),
-            estimate=(filters["mean"][:, :2] >= low) & (filters["mean"][:, :2] <= high),
-            variance=variance >= 0.0,
-            covariance=np.abs(covariance) <= (1.0 + _ROUNDED) * most,
-            count=np.array(counts) >= 0,
-            charge=np.isfinite(seen["drawn_C"]) & np.isfinite(seen["current_A"]) & (seen["time_s"] >= 0.0),
-            fault=np.isin(seen["fault"]["condition"], [0, *Condition]),
-            constants=cell["constants"] == self._of_rows(arrays["cells"], arrays["filters"])._cell_now().packed.constants,
-        )
-
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
 
 
-class KalmanBatch(OnlineBatch):
+class KalmanBatch:
     """
     Cells side by side, each followed by a filter of its own with the same arguments: rows of the same tables, which take their
     samples in one compiled call.
 
+    :ivar estimators: these filters
     :param estimator: what to copy; it stays as it is
     :param cells: how many
     :raises ValueError: for no cells
     """
 
-    estimators: Sequence[ExtendedKalmanFilter]
-
-    def _copies(self, estimator: OnlineEstimator, cells: int) -> Sequence[ExtendedKalmanFilter]:
-        assert isinstance(estimator, ExtendedKalmanFilter)
+    def __init__(self, estimator: ExtendedKalmanFilter, cells: int) -> None:
+        if check_whole_number("cells", cells) < 1:
+            raise ValueError(f"cells must be at least 1, got {cells!r}")
         self._cells = np.zeros(cells, CELL)
         self._filters = np.zeros((cells, estimator._filters.shape[1]), FILTER)
-        return [estimator._of_rows(self._cells[n : n + 1], self._filters[n : n + 1]) for n in range(cells)]
+        self.estimators = [estimator._of_rows(self._cells[n : n + 1], self._filters[n : n + 1]) for n in range(cells)]
+        self.reset()
+
+    def reset(self, cells: Iterable[int] | None = None) -> None:
+        """Let discharges begin."""
+        for n in range(len(self.estimators)) if cells is None else cells:
+            self.estimators[n].reset()
 
     def update(
         self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
@@ -385,7 +367,14 @@ class KalmanBatch(OnlineBatch):
         good = are_plausible(of["voltage_V"], of["current_A"], of["dt_s"], degrees_C, seen["current_A"])
         doubtful = is_first | ~(good & (drawn_C > one.least_drawn_C))
         if doubtful.any():
-            self.check(voltage_V, current_A, dt_s, temperature_C, np.flatnonzero(doubtful).tolist())
+            # as objects, so that what is no number turns no other one into a text
+            given = (np.asarray(each, dtype=object) for each in (voltage_V, current_A, dt_s, temperature_C))
+            of_cells = list(zip(*(np.broadcast_to(each, len(cells)).tolist() for each in given), strict=True))
+            for n in np.flatnonzero(doubtful).tolist():
+                try:
+                    self.estimators[n].check(*of_cells[n])
+                except (TypeError, ValueError) as error:
+                    raise type(error)(f"cell {n}: {error}") from error
         for n in np.flatnonzero(is_first & ~np.isnan(of["temperature_K"])).tolist():
             self.estimators[n]._begin(float(of["temperature_K"][n]))
         (said,) = one._follow(cells, self._filters, samples)
@@ -398,6 +387,21 @@ class KalmanBatch(OnlineBatch):
 
         settled_q_mobile, settled_r_o = (said["condition"] == Condition.SETTLED).T
         return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled_q_mobile, settled_r_o, reason_of)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write what is known of all cells, as :meth:`ExtendedKalmanFilter.save`."""
+        return save_state(path, self._made_with(), self._arrays())
+
+    def load(self, path: str | os.PathLike[str]) -> None:
+        """Go on from what :meth:`save` wrote."""
+        arrays = load_state(path, self._made_with())
+        self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
+
+    def _made_with(self) -> dict[str, Any]:
+        return {"cells": len(self.estimators), **self.estimators[0]._made_with()}
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {"cells": self._cells, "filters": self._filters}
 
 
 def _verdict(first: Sequence[int], r_o_comes_first: bool, shown: Mapping[str, Any]) -> Verdict:

@@ -15,39 +15,22 @@ Q, R, OFFSET = range(3)
 
 
 class Settings(NamedTuple):
-    """
-    What a filter is told, with pairs for ``q_mobile`` and ``r_o``.
+    """What a filter is told, with pairs for ``q_mobile`` and ``r_o``."""
 
-    :param dt_s: longest time step of the model, s
-    :param thermal: whether the temperature of the model moves
-    :param noise_V2: variance of the voltage noise, V^2
-    :param mismatch_V2: variance of the error of the model, V^2
-    :param searched: whether each is searched for
-    :param variance: of each before the discharge, 0 where it is held, C^2 and ohm^2
-    :param growth: of the variance of each, C^2/s and ohm^2/s
-    :param offset_growth: of the variance of the offset, V^2/s
-    :param bounds: where each stays, C and ohm
-    :param carried: mean and standard deviation of each from an earlier discharge; zeros where none was given
-    :param gain_sd: standard deviation of the gain of the current sensor, which scales both and does not show in the voltage
-    :param sd_soc: that of the charge at the start, as a share of it
-    :param cell_q_mobile: of the model's cell, C
-    :param cell_sd_r_o: what the constants of that cell leave open of ``r_o``, ohm
-    """
-
-    dt_s: float
-    thermal: bool
-    noise_V2: float
-    mismatch_V2: float
-    searched: tuple[bool, bool]
-    variance: tuple[float, float]
-    growth: tuple[float, float]
-    offset_growth: float
-    bounds: tuple[tuple[float, float], tuple[float, float]]
-    carried: tuple[tuple[float, float], tuple[float, float]]
-    gain_sd: float
-    sd_soc: float
-    cell_q_mobile: float
-    cell_sd_r_o: float
+    dt_s: float  # longest time step of the model, s
+    thermal: bool  # whether the temperature of the model moves
+    noise_V2: float  # variance of the voltage noise, V^2
+    mismatch_V2: float  # variance of the error of the model, V^2
+    searched: tuple[bool, bool]  # whether each is searched for
+    variance: tuple[float, float]  # of each before the discharge, 0 where it is held, C^2 and ohm^2
+    growth: tuple[float, float]  # of the variance of each, C^2/s and ohm^2/s
+    offset_growth: float  # of the variance of the offset, V^2/s
+    bounds: tuple[tuple[float, float], tuple[float, float]]  # where each stays, C and ohm
+    carried: tuple[tuple[float, float], tuple[float, float]]  # mean and sd of each from an earlier discharge; 0: none
+    gain_sd: float  # of the current sensor, which scales both and does not show in the voltage
+    sd_soc: float  # that of the charge at the start, as a share of it
+    cell_q_mobile: float  # of the model's cell, C
+    cell_sd_r_o: float  # what the constants of that cell leave open of ``r_o``, ohm
 
 
 #: One sample of one cell; its current is the mean until the next one, and was read at its time.

@@ -108,23 +108,14 @@ _FEW_WORDS, _AROUND_UNITS = 20, "[]()- "
 
 
 class Column(NamedTuple):
-    """
-    A column and what makes SI of it.
+    """A column and what makes SI of it."""
 
-    :param position: among the columns of the table
-    :param name: as the table has it
-    :param factor: what its values are multiplied with to give s, V or A, or differences of temperature in K
-    :param offset: what is added then
-    :param unit: as its name or the caller says, empty if neither does
-    :param words: its name without the unit, in lower case without gaps
-    """
-
-    position: int
-    name: str
-    factor: float = 1.0
-    offset: float = 0.0
-    unit: str = ""
-    words: str = ""
+    position: int  # among the columns of the table
+    name: str  # as the table has it
+    factor: float = 1.0  # makes s, V or A of its values, or differences of temperature in K
+    offset: float = 0.0  # is added then
+    unit: str = ""  # as its name or the caller says, empty if neither does
+    words: str = ""  # its name without the unit, in lower case without gaps
 
 
 @dataclass(frozen=True)
@@ -148,13 +139,10 @@ def find_columns(
     names: Sequence[str], file_format: FileFormat | None = None, rows: Iterable[Sequence[str]] = ()
 ) -> dict[str, Column]:
     """
-    The columns of a record. A unit is told from the name, as in ``Current(mA)``, ``Voltage / V``, ``mAmps`` or
-    ``test_time_second``; a name without one is in s, V, A or degC. A unit of another quantity rules a column out.
-
-    :param names: of all columns
-    :param file_format: what is known of them
-    :param rows: the first rows; columns of words may say which of them are charges
-    :return: by quantity; columns that may serve as well have its name and a number, as ``time 2``
+    The columns of a record by quantity, from the names of all columns and the first rows, whose words may say which are
+    charges. Columns that may serve as well have the quantity and a number, as ``time 2``. A unit is told from the name, as in
+    ``Current(mA)``, ``Voltage / V``, ``mAmps`` or ``test_time_second``; a name without one is in s, V, A or degC. A unit of
+    another quantity rules a column out.
     """
     file_format = file_format or FileFormat()
     chosen, units, ignore = file_format.columns or {}, file_format.units or {}, [name.strip() for name in file_format.ignore]

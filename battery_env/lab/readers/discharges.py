@@ -51,16 +51,11 @@ _STEP_ADVICE = re.compile(r", or name the column of its step|, and one that does
 
 
 class Recording(NamedTuple):
-    """
-    What a file or a table holds of one discharge, not checked yet.
+    """What a file or a table holds of one discharge, not checked yet."""
 
-    :param arrays: arguments of :class:`~battery_env.Discharge`, by name
-    :param meta: what else is known; ``cycle`` is missing if the file holds one discharge and does not number it
-    :param stated: quantities whose unit is known, ``step`` if it has a column, and ``sign`` if that was told from the data
-    """
-
-    arrays: dict[str, Any]
-    meta: dict[str, Any]
+    arrays: dict[str, Any]  # arguments of Discharge, by name
+    meta: dict[str, Any]  # what else is known; without ``cycle`` if the file holds one discharge and does not number it
+    # quantities of known unit, ``step`` if it has a column, ``sign`` if that was told from the data
     stated: frozenset[str] = frozenset()
 
     def discharge(self) -> Discharge:

@@ -49,12 +49,8 @@ _THOUSANDS = re.compile(r"^\s*[-+]?\d{1,3}(?:[,.' ]\d{3})+(?:[.,]\d+)?\s*$")
 
 def cells_of(table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> dict[str, pd.DataFrame]:
     """
-    The rows of each cell.
-
-    :param table: columns by quantity, as they were written; its index counts the rows below the header
-    :param columns: their names and units
-    :param file_format: what the caller says
-    :return: by cell, in SI units; the name is empty where the table holds one
+    The rows of each cell in SI units, of a table with columns by quantity as they were written, whose index counts the rows
+    below the header; the name is empty where the table holds one cell.
     """
     for mend in (without_blank_rows, without_headers, without_cut_line):
         table = mend(table, columns)

@@ -79,9 +79,16 @@ def read_columns(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dic
         return columns_of(_read_neware(path), file_format)
     if suffix == ".mpr":
         return columns_of(_read_biologic(path), file_format)
-    if suffix in (".xlsx", ".xls") and _head(path).startswith(_WORKBOOKS):
+    head = _content(path, _HEAD_BYTES)
+    if suffix in (".xlsx", ".xls") and head.startswith(_WORKBOOKS):
         return _read_text(_sheet(path, file_format), file_format)
-    return _read_text(path, file_format)
+    is_odd = b"\n" not in head or _QUOTED_LINES.search(head)
+    if not is_odd and suffix not in PACKED_SUFFIXES:
+        return _read_text(path, file_format)
+    content = _content(path)
+    if is_odd:  # lines may end as on old computers, too
+        content = _QUOTED_LINES.sub(rb"\1", content if b"\n" in head else content.replace(b"\r", b"\n"))
+    return _read_text(content, file_format)
 
 
 def columns_of(table: pd.DataFrame, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
@@ -97,13 +104,7 @@ def _first_rows(table: pd.DataFrame) -> list[list[str]]:
 
 
 def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
-    head = source[:_HEAD_BYTES] if isinstance(source, bytes) else _head(source)
-    if isinstance(source, Path) and (b"\n" not in head or _QUOTED_LINES.search(head)):
-        # lines may end as on old computers
-        content = _content(source) if b"\n" in head else _content(source).replace(b"\r", b"\n")
-        source = _QUOTED_LINES.sub(rb"\1", content)
-        head = source[:_HEAD_BYTES]
-    layout = _layout(head, file_format.columns)
+    layout = _layout(source[:_HEAD_BYTES] if isinstance(source, bytes) else _content(source, _HEAD_BYTES), file_format.columns)
     columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
     header_lines += bool(layout.rows) and are_units(layout.rows[0])
     # one column may serve as two quantities
@@ -111,9 +112,8 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
 
     def read(rows: int | None = None) -> pd.DataFrame:
         try:
-            packed = isinstance(source, Path) and source.suffix.lower() in PACKED_SUFFIXES
             found = pd.read_csv(
-                io.BytesIO(source) if isinstance(source, bytes) else _open(source) if packed else source,
+                io.BytesIO(source) if isinstance(source, bytes) else source,
                 sep=layout.delimiter,
                 decimal=layout.decimal,
                 encoding=layout.encoding,
@@ -127,7 +127,7 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
             )
         except pd.errors.EmptyDataError as error:
             raise ValueError("there are no rows below the header") from error
-        except Exception as error:  # pandas and the unpackers raise whatever the damage leads them to
+        except Exception as error:  # pandas raises whatever the damage leads it to
             raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
         # words among numbers make text of all
         return found if layout.decimal == "." else found.replace(_ITS_COMMA, r"\1.", regex=True)
@@ -137,7 +137,8 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
     except ValueError as error:
         if "EOF inside string" not in str(error):
             raise
-        kept, _, last = _content(source).decode(layout.encoding, errors="ignore").rstrip().rpartition("\n")
+        content = source if isinstance(source, bytes) else _content(source)
+        kept, _, last = content.decode(layout.encoding, errors="ignore").rstrip().rpartition("\n")
         if last.count('"') % 2 == 0:
             raise
         warnings.warn("the last line is cut within quotes, and left out", stacklevel=2)
@@ -157,11 +158,22 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
     return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
 
 
-def _content(source: Path | bytes) -> bytes:
-    if isinstance(source, bytes):
-        return source
-    with _open(source) as stream:
-        return stream.read()
+def _content(path: Path, most_bytes: int | None = None) -> bytes:
+    """The content of a file, or its beginning, unpacked; refused where it becomes far larger than it was."""
+    parts, count = [], 0
+    try:
+        with _open(path) as stream:
+            while part := stream.read(most_bytes or _CHUNK_BYTES):
+                parts.append(part)
+                count += len(part)
+                if most_bytes:
+                    break
+                check_unpacked(path.stat().st_size, count)
+    except (FileNotFoundError, IsADirectoryError, PermissionError):
+        raise
+    except Exception as error:  # the unpackers raise whatever the damage leads them to
+        raise ValueError(f"the file is damaged: {str(error).strip() or type(error).__name__}") from error
+    return b"".join(parts)
 
 
 def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
@@ -180,44 +192,6 @@ def _foot_lines(measured: pd.DataFrame) -> int:
     return int(np.argmin(nothing[::-1])) if len(nothing) else 0
 
 
-def _head(path: Path) -> bytes:
-    """The beginning of a file, unpacked."""
-    try:
-        with _open(path) as stream:
-            head = stream.read(_HEAD_BYTES)
-    except (FileNotFoundError, IsADirectoryError, PermissionError):
-        raise
-    except Exception as error:
-        raise ValueError(f"the file is damaged: {str(error).strip() or type(error).__name__}") from error
-    if not head.strip():
-        raise ValueError("the file is empty")
-    return head
-
-
-class _Unpacked(io.BufferedIOBase):
-    """What a stream unpacks, refused where it becomes far larger than it was."""
-
-    def __init__(self, stream: IO[bytes], packed_bytes: int) -> None:
-        self._stream, self._packed_bytes, self._count = stream, packed_bytes, 0
-
-    def readable(self) -> bool:
-        return True
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        if size is None or size < 0:
-            return b"".join(iter(lambda: self.read(_CHUNK_BYTES), b""))
-        content = self._stream.read(min(size, _CHUNK_BYTES))
-        self._count += len(content)
-        check_unpacked(self._packed_bytes, self._count)
-        return content
-
-    read1 = read
-
-    def close(self) -> None:
-        self._stream.close()
-        super().close()
-
-
 def _check_archive(path: Path) -> None:
     """Refuse a file that holds an archive of what is far larger."""
     if zipfile.is_zipfile(path):
@@ -226,11 +200,6 @@ def _check_archive(path: Path) -> None:
 
 
 def _open(path: Path) -> IO[bytes]:
-    stream = _unpacking(path)
-    return stream if path.suffix.lower() not in PACKED_SUFFIXES else cast(IO[bytes], _Unpacked(stream, path.stat().st_size))
-
-
-def _unpacking(path: Path) -> IO[bytes]:
     suffix = path.suffix.lower()
     if suffix == ".zip":
         archive = zipfile.ZipFile(path)
@@ -238,7 +207,7 @@ def _unpacking(path: Path) -> IO[bytes]:
         if len(names) != 1:
             raise ValueError(f"the archive must hold one file, got {len(names)}")
         return archive.open(names[0])
-    return _OPENERS[suffix](path) if suffix in _OPENERS else path.open("rb")
+    return cast(IO[bytes], _OPENERS.get(suffix, open)(path, "rb"))
 
 
 def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:

@@ -1,8 +1,5 @@
 """
-Calibration from the full state of a cell as a Markov decision process, for a batch of cells at once.
-
-The agent picks the aged parameter of the model. The model then takes one step from its own state x̂_t under the load. The cost
-is how far a voltage of its state, or all of it, is from the measured x_{t+1} (Unagar et al. 2020).
+Calibration from the full state of a cell as a Markov decision process (Unagar et al. 2020), for a batch of cells at once.
 """
 
 from __future__ import annotations
@@ -56,7 +53,9 @@ def _reachable(
 class FullStateTask(CalibrationTask):
     """
     The paper's task for ``cells`` cells side by side. The state of the cell is measured. One parameter is to be found and the
-    other one is known, or both are to be found. The registered tasks differ in attributes of their classes. The page of
+    other one is known, or both are to be found. The agent picks them for the model, which then takes one step from its own
+    state x̂_t under the load. The cost is how far a voltage of its state, or all of it, is from the measured x_{t+1}. The
+    registered tasks differ in attributes of their classes. The page of
     :class:`~battery_env.tasks.full_state.pages.BatteryQmax` describes the options.
 
     The cell is simulated beside the model, from the parameters and loads of the data set. The model is extended where a wrong
@@ -68,6 +67,7 @@ class FullStateTask(CalibrationTask):
     :raises ValueError: for values out of range
     """
 
+    is_averaged = True  # each estimate is made of its own sample
     formulation: Formulation = SCALED
     episode_steps = 64
     dataset: TrajectoryDataset
@@ -255,11 +255,6 @@ class FullStateTask(CalibrationTask):
         """(q_mobile, r_o) of the model, C and ohm, shape (cells, 2)."""
         return np.stack([self.now["q_mobile_hat"], self.now["r_o_hat"]], axis=1)
 
-    @staticmethod
-    def conclude(estimates: FloatArray) -> float:
-        """The mean, for each estimate is made of its own sample."""
-        return float(estimates.mean())
-
     def drop_ended(self) -> None:
         """Go on without the cells whose episodes are over."""
         over = self.truncated()
@@ -282,10 +277,8 @@ class FullStateTask(CalibrationTask):
 
     def action_of(self, values: Mapping[str, ArrayLike]) -> FloatArray:
         """
-        The actions that stand for parameters.
-
-        :param values: at least those to be found, by name, C and ohm, shape (...)
-        :return: shape (..., len(parameters)), beyond [-1, 1] for parameters out of the actions' range
+        The actions that stand for parameters by name, C and ohm, beyond [-1, 1] out of their range: shape (...,
+        len(parameters)).
         """
         wanted = np.stack([np.asarray(values[name], dtype=np.float64) for name in self.parameters], axis=-1)
         lowest, highest = np.array([self.formulation.action_ranges[name] for name in self.parameters]).T

@@ -78,64 +78,37 @@ assert UNCERTAIN_CONSTANTS == ("kn", "tDiffusion", "to", "tsn")
 
 
 class Fitted(NamedTuple):
-    """
-    What a fit says of each cell of a batch.
+    """What a fit says of each cell of a batch."""
 
-    :param estimate: (q_mobile, r_o) after its step, C and ohm, shape (cells, 2)
-    :param sd: their standard deviations under the priors, 0 where one is known, same shape
-    :param noise_V: root mean square of the residuals that it leaves, V, shape (cells,)
-    :param offset_V: of the voltage sensor, V, shape (cells,)
-    :param sd_alone: what they would be if nothing were known of the parameters before, same shape
-    :param constants: logarithms of what ``UNCERTAIN_CONSTANTS`` are multiplied by, and along a path what is added to the
-        equilibrium voltage, V, shape (cells, 4) or (cells, 12)
-    :param constants_sd: how far the constant lies from the model's that is the farthest, as a multiple of its standard
-        deviation; along a path how far the cell lies beside it, shape (cells,)
-    :param readings: to how many it is a fit, shape (cells,)
-    :param white_V: white part of their noise, which no model can explain, V, shape (cells,); infinite where they are too few
-    """
-
-    estimate: FloatArray
-    sd: FloatArray
-    sd_alone: FloatArray
-    constants: FloatArray
-    noise_V: FloatArray
-    offset_V: FloatArray
-    constants_sd: FloatArray
-    readings: IntArray
-    white_V: FloatArray
+    estimate: FloatArray  # (q_mobile, r_o) after its step, C and ohm, shape (cells, 2)
+    sd: FloatArray  # their standard deviations under the priors, 0 where one is known, same shape
+    sd_alone: FloatArray  # what they would be if nothing were known of the parameters before, same shape
+    constants: FloatArray  # as of NuisanceFit, shape (cells, 4) or (cells, 12)
+    noise_V: FloatArray  # root mean square of the residuals that it leaves, V, shape (cells,)
+    offset_V: FloatArray  # of the voltage sensor, V, shape (cells,)
+    constants_sd: FloatArray  # of the farthest constant, or of the cell beside its path, standard deviations, shape (cells,)
+    readings: IntArray  # to how many it is a fit, shape (cells,)
+    white_V: FloatArray  # noise that no model can explain, V, shape (cells,); infinite where readings are too few
 
 
 @dataclass(frozen=True, eq=False)
 class FitPrior:
-    """
-    What is known of the unknowns before a discharge: normal, in units of their own.
+    """What is known of the unknowns before a discharge: normal, in units of their own."""
 
-    :param mean: of all unknowns, shape (n,)
-    :param units: shape (n,); 0 for a parameter that is known
-    :param precision: the inverse of the covariance, in these units, shape (n, n)
-    :param alone: the same if nothing were known of the parameters, nor of what goes together with them
-    :param shown: what constants are divided by where an agent sees them, shape (n - 3,)
-    :param path: that the mean of parameters is of: their logarithms then, in the order of the unknowns; ``None``: no path
-    """
-
-    mean: FloatArray
-    units: FloatArray
-    precision: FloatArray
-    alone: FloatArray
-    shown: FloatArray
-    path: AgingPath | None = None
+    mean: FloatArray  # of all unknowns, shape (n,)
+    units: FloatArray  # shape (n,); 0 for a parameter that is known
+    precision: FloatArray  # the inverse of the covariance, in these units, shape (n, n)
+    alone: FloatArray  # the same if nothing were known of the parameters, nor of what goes together with them
+    shown: FloatArray  # what constants are divided by where an agent sees them, shape (n - 3,)
+    path: AgingPath | None = None  # of whose cells the mean of parameters is that of their logarithms; ``None``: no path
 
     @classmethod
     def of_ranges(
         cls, parameters: Sequence[str], ranges: Mapping[str, tuple[float, float]], offset_V: float, nuisance: float
     ) -> FitPrior:
         """
-        Each for itself: parameters have the mean and the standard deviation of their ranges.
-
-        :param parameters: which of both are to be found
-        :param ranges: where they are kept, C and ohm
-        :param offset_V: bound of the offset, V
-        :param nuisance: relative standard deviation of the constants
+        Each for itself: parameters, those of ``parameters`` unknown, have the mean and the standard deviation of their ranges,
+        C and ohm; constants a relative standard deviation.
         """
         limits = np.array(list(ranges.values()))
         unknown = [name in parameters for name in ranges]
@@ -149,12 +122,7 @@ class FitPrior:
 
     @classmethod
     def along(cls, path: AgingPath, offset_V: float) -> FitPrior:
-        """
-        What goes together along a path.
-
-        :param path: how cells of the kind age
-        :param offset_V: bound of the offset, V
-        """
+        """What goes together along a path of aging cells."""
         order = [PATH_NAMES.index(name) for name in (*PARAMETER_NAMES, *UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES)]
         of_path = [k for k in range(len(order) + 1) if k != _OFFSET]
         mean, covariance = path.moments
@@ -170,23 +138,14 @@ class FitPrior:
 
 
 class Known(NamedTuple):
-    """
-    What a step knows before the readings.
+    """What a step knows before the readings."""
 
-    :param mean: of all unknowns, shape (n, unknowns)
-    :param units: likewise
-    :param precision: as of :class:`FitPrior`, shape (unknowns, unknowns)
-    :param alone: likewise
-    :param mismatch_V: what the model is expected to be off for all its constants, V
-    :param errors_per_C: how many independent errors of the model a coulomb shows, besides a first one
-    """
-
-    mean: FloatArray
-    units: FloatArray
-    precision: FloatArray
-    alone: FloatArray
-    mismatch_V: float
-    errors_per_C: float
+    mean: FloatArray  # of all unknowns, shape (n, unknowns)
+    units: FloatArray  # likewise
+    precision: FloatArray  # as of FitPrior, shape (unknowns, unknowns)
+    alone: FloatArray  # likewise
+    mismatch_V: float  # what the model is expected to be off for all its constants, V
+    errors_per_C: float  # how many independent errors of the model a coulomb shows, besides a first one
 
 
 class NuisanceFit:
@@ -195,12 +154,8 @@ class NuisanceFit:
     that nobody knows exactly, under a prior. One Gauss-Newton step is taken whenever the estimate moves or readings arrive; it
     moves the constants, and is shown to the agent, which moves the parameters.
 
-    :param cells: size of the batch
-    :param model: of :attr:`~battery_env.tasks.voltage.readings.Readings.model`
-    :param cell: whose constants it has
-    :param parameters: which of both are to be found
-    :param prior: what is known before
-    :ivar constants: as of :class:`Fitted`
+    :ivar constants: logarithms of what ``UNCERTAIN_CONSTANTS`` are multiplied by, and along a path what is added to the
+        equilibrium voltage, V, shape (cells, 4) or (cells, 12)
     """
 
     def __init__(
@@ -580,14 +535,9 @@ def nuisance_step(
 ) -> None:
     """
     One Gauss-Newton step towards the (q_mobile, r_o), offset and constants that explain the readings of each cell best under
-    their prior; unchecked, all arrays contiguous. The arguments that :func:`battery_env.tasks.voltage.readings.explain` has
-    too are the same.
-
-    :param constants: as of :class:`Fitted`, shape (n, constants)
-    :param added: what the coefficients of the equilibrium voltage among them add to the model, shape (coefficients,
-        1 + POLYNOMIAL_SIZE)
-    :param known: what is known before
-    :param found: overwritten: what :func:`found_size` counts, shape (n, found_size)
+    their prior, into ``found``, shape (n, found_size); unchecked, all arrays contiguous. The arguments that
+    :func:`battery_env.tasks.voltage.readings.explain` has too are the same. ``added`` is what the coefficients of the
+    equilibrium voltage among the constants add to the model, shape (coefficients, 1 + POLYNOMIAL_SIZE).
     """
     unknowns = known.mean.shape[1]
     sums, before = np.empty((unknowns + 1, unknowns + 1)), np.zeros(unknowns)

@@ -75,37 +75,22 @@ class Readings:
     At a given history of the current the charges of the model are linear in ``q_mobile`` and its ohmic drop is linear in
     ``r_o``; so both follow for every (q_mobile, r_o) from two numbers a reading. Only the surface overpotentials must be
     integrated anew, which takes one step a reading (:func:`explain`). All discharges lie end to end.
-
-    :param start: where each discharge starts, shape (n,)
-    :param start_s: time of its first sample, s, shape (n,)
-    :param count: how many readings it has, shape (n,)
-    :param time_s: of the readings since the first sample, s, shape (total,)
-    :param voltage_V: terminal voltage at the readings, shape (total,)
-    :param current_A: mean current since the reading before, shape (total,)
-    :param drawn_C: charge drawn since the start, shape (total,)
-    :param moved_C: how much of it has left the surface of the negative electrode, shape (total,)
-    :param ohmic_A: ohmic drop per ohm of ``r_o``, shape (total,)
-    :param q_mobile: true value, C, NaN where it is not known, shape (n,)
-    :param r_o: true value, ohm, NaN where it is not known, shape (n,)
-    :param interval_s: least time between readings, s
-    :param dt_s: time step at which the current was followed, s; readings are taken to lie at whole numbers of them
-    :param cell: constants of the model
     """
 
-    start: IntArray
-    start_s: FloatArray
-    count: IntArray
-    time_s: FloatArray
-    voltage_V: FloatArray
-    current_A: FloatArray
-    drawn_C: FloatArray
-    moved_C: FloatArray
-    ohmic_A: FloatArray
-    q_mobile: FloatArray
-    r_o: FloatArray
-    interval_s: float
-    dt_s: float
-    cell: CellParameters
+    start: IntArray  # where each discharge starts, shape (n,)
+    start_s: FloatArray  # time of its first sample, s, shape (n,)
+    count: IntArray  # how many readings it has, shape (n,)
+    time_s: FloatArray  # of the readings since the first sample, s, shape (total,), as all that follow
+    voltage_V: FloatArray  # terminal voltage
+    current_A: FloatArray  # mean since the reading before
+    drawn_C: FloatArray  # charge drawn since the start
+    moved_C: FloatArray  # how much of it has left the surface of the negative electrode
+    ohmic_A: FloatArray  # ohmic drop per ohm of ``r_o``
+    q_mobile: FloatArray  # true value, C, NaN where it is not known, shape (n,)
+    r_o: FloatArray  # true value, ohm, NaN where it is not known, shape (n,)
+    interval_s: float  # least time between readings, s
+    dt_s: float  # step at which the current was followed, s; readings are taken to lie at whole numbers of them
+    cell: CellParameters  # constants of the model
 
     @classmethod
     def of(
@@ -116,12 +101,10 @@ class Readings:
         cell: CellParameters = NEW_CELL,
     ) -> Readings:
         """
-        Read discharges at their samples, or at some of them, so that readings lie ``interval_s`` apart at least.
-
-        :param records: discharges; one may say with ``measured`` which of its samples have a voltage, shape (K,)
-        :param interval_s: least time between readings, s; or the range that a mean time is drawn from for each discharge, with
-            intervals of half as long to half as long again, as testers write them
-        :raises ValueError: for an interval that is no whole number of steps, or a discharge without two readings
+        Read discharges at their samples, or at some of them, so that readings lie ``interval_s`` apart at least, a whole
+        number of steps; or, of (least, most), at intervals of half a mean time to half as long again, as testers write them,
+        with a mean that is drawn for each discharge. A record may say with ``measured`` which of its samples have a voltage,
+        shape (K,).
         """
         low_s, high_s = interval_s if isinstance(interval_s, Sequence) else (interval_s, interval_s)
         least = round(low_s / dt_s)
@@ -289,25 +272,15 @@ def _linear_part(
 
 
 class Overpotentials(NamedTuple):
-    """
-    Surface overpotentials at a reading, V, and what they went of their way since the one before.
+    """Surface overpotentials at a reading, V, and what they went of their way since the one before."""
 
-    :param vsn: of the negative electrode
-    :param vsp: of the positive electrode
-    :param further_vsn: of the negative electrode at q (1 + ``RELATIVE_STEP``)
-    :param further_vsp: likewise of the positive one
-    :param steps: of the model since the reading before
-    :param relaxed_n: the share that Vsn went in these
-    :param relaxed_p: likewise Vsp
-    """
-
-    vsn: float
-    vsp: float
-    further_vsn: float
-    further_vsp: float
-    steps: float
-    relaxed_n: float
-    relaxed_p: float
+    vsn: float  # of the negative electrode
+    vsp: float  # of the positive electrode
+    further_vsn: float  # of the negative electrode at q (1 + ``RELATIVE_STEP``)
+    further_vsp: float  # likewise of the positive one
+    steps: float  # of the model since the reading before
+    relaxed_n: float  # the share that Vsn went in these
+    relaxed_p: float  # likewise Vsp
 
 
 #: Before the first reading.
@@ -444,7 +417,6 @@ def explain(
     :param count: how many readings of each cell there are, shape (n,)
     :param estimate: q_mobile and r_o, shape (n, 2)
     :param shown: as of :meth:`Readings.shown`, shape (SHOWN, n, most readings)
-    :param model: of :attr:`Readings.model`
     :param means: overwritten: of the residual, dV/dq and the ohmic drop per ohm over the readings with less and with more
         current in equal stretches, shape (3, n, stretches, 2)
     :param rms_V: overwritten: root mean square of the residuals, shape (n,)

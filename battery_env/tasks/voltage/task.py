@@ -1,9 +1,4 @@
-"""
-Calibration from current and voltage alone, for a batch of cells at once: no state of the cell is measured.
-
-The paper names this as future work. The parameters are constant within a discharge, so that the agent is asked to explain all
-data so far with one (q_mobile, r_o): it holds an estimate, sees what the data say against it, and moves it.
-"""
+"""Calibration from current and voltage alone, for a batch of cells at once: no state of the cell is measured."""
 
 from __future__ import annotations
 
@@ -89,6 +84,8 @@ class VoltageTask(CalibrationTask):
     :param cells: size of the batch
     :raises ValueError: for values out of range
     """
+
+    is_averaged = False
 
     def __init__(
         self,
@@ -223,8 +220,6 @@ class VoltageTask(CalibrationTask):
         """
         What the task can be asked for; its page says what each option means. Errors of the sensors are those of
         :class:`~battery_env.sensors.RandomSensorErrors`.
-
-        :return: default values by name
         """
         return {**super().options(), **asdict(SENSORS)}
 
@@ -340,11 +335,6 @@ class VoltageTask(CalibrationTask):
         white_V = [white_noise_V(each[:end], order=2) if end > 2 else np.inf for each, end in parts]
         return self._fit.found(self._estimate, self.count.copy(), np.array(white_V))
 
-    @staticmethod
-    def conclude(estimates: FloatArray) -> float:
-        """The last estimate, which explains all readings."""
-        return float(estimates[-1])
-
     def _place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
         """Put one cell at one point of one discharge, measured without error."""
         length = self.readings.count[discharge]
@@ -399,13 +389,7 @@ class VoltageTask(CalibrationTask):
         self._misfit_V = np.sqrt(np.mean((residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
 
     def restore(self, estimate: FloatArray, action: FloatArray, constants: FloatArray) -> None:
-        """
-        Let all cells stand where a policy left off.
-
-        :param estimate: (q_mobile, r_o), C and ohm, shape (2,) or (cells, 2)
-        :param action: the last one, shape (len(parameters),) or (cells, len(parameters))
-        :param constants: as of :attr:`constants`
-        """
+        """Let all cells stand where a policy left off: at its estimate, C and ohm, its last action, and :attr:`constants`."""
         self._estimate[:], self._action[:] = estimate, action
         if self._fit is not None:
             self._fit.constants[:] = constants
@@ -414,8 +398,8 @@ class VoltageTask(CalibrationTask):
     @property
     def constants(self) -> FloatArray:
         """
-        What the fit in the observation says of the constants, as of :class:`~battery_env.tasks.voltage.fit.Fitted`; nothing
-        without one; a new array each time.
+        What the fit in the observation says of the constants, as of :class:`~battery_env.tasks.voltage.fit.NuisanceFit`; a new
+        array.
         """
         return np.zeros((self.cells, 0)) if self._fit is None else self._fit.constants.copy()
 
