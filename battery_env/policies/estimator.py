@@ -46,6 +46,8 @@ from battery_env.tasks.voltage.task import VoltageTask
 _STEP_S = 1.0
 # No number that a fit finds comes near, C, ohm or V.
 _LARGEST = 1e9
+# Of a decision that is not judged.
+_NOT_JUDGED = Verdict(False, False, Condition.NOT_YET.text)
 
 
 class Predictor(Protocol):
@@ -174,7 +176,7 @@ class PolicyEstimator(OnlineEstimator):
     def _judge(self) -> None:
         """Tell how sure the estimate is, of the samples up to the last decision."""
         self._sd, self._found = [nan, nan], None
-        self._verdict = Verdict(False, False, (Condition.NO_FIT if self._confidence is None else Condition.NOT_YET).text)
+        self._verdict = Verdict(False, False, Condition.NO_FIT.text) if self._confidence is None else _NOT_JUDGED
         if self._confidence is not None and self._fitted is not None:
             samples = self._readings.known(self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
@@ -308,7 +310,7 @@ class PolicyEstimator(OnlineEstimator):
         :raises ValueError: for an invalid record
         """
         check_drawn_charge(drawn_charge_C(check_record(record)))
-        trace = self.trace([record])[0]
+        trace = self._traces([record], judge_last_only=True)[0]
         if trace.sd_q_mobile is not None:
             return last_estimate(trace)
         q_mobile, r_o = (self.task_class.conclude(values) for values in (trace.q_mobile, trace.r_o))
@@ -321,6 +323,10 @@ class PolicyEstimator(OnlineEstimator):
         :param records: discharges; a :class:`~battery_env.trajectories.TrajectoryDataset` is such a sequence
         :return: one trace per discharge, in the same order
         """
+        return self._traces(records)
+
+    def _traces(self, records: Sequence[Record], judge_last_only: bool = False) -> list[EstimateTrace]:
+        """Those of :meth:`trace`; a verdict takes longer than a decision, and may be left to the last of each discharge."""
         task = self._follow(records, self.decision_s)
         samples = [] if self._confidence is None else [(Samples.of(record), shown_beside(record)) for record in records]
         made: list[FloatArray] = []
@@ -335,7 +341,12 @@ class PolicyEstimator(OnlineEstimator):
             if self._confidence is not None and fitted is not None:
                 sd = self._confidence.standard_deviations(fitted, estimate)
                 columns.append(sd)
+                is_open = judge_last_only & ~task.truncated()
                 for n in np.flatnonzero(running).tolist():
+                    if is_open[n]:
+                        verdicts.append(_NOT_JUDGED)
+                        found.append(None)
+                        continue
                     record, shown = samples[discharge[n]]
                     so_far = record.first(int(np.searchsorted(record.time_s, time_s[n], side="right")))
                     verdicts.append(self._confidence.verdict(fitted, n, estimate[n], so_far, shown))
@@ -351,6 +362,6 @@ class PolicyEstimator(OnlineEstimator):
         texts = np.array([each.reason for each in verdicts], dtype=object)
         said = (settled_q & settled_r_o, texts, settled_q, settled_r_o)
         traces = [EstimateTrace(*rows[n, 1:4].T, *rows[n, 4:6].T, *(column[n] for column in said)) for n in of_each]
-        if found[0] is None:
+        if found[-1] is None:
             return traces
         return [replace(trace, constants=[found[k] for k in n]) for trace, n in zip(traces, of_each, strict=True)]
