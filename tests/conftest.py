@@ -1,5 +1,6 @@
 """What makes the tests say the same on every machine."""
 
+import gc
 import os
 
 # Before numpy and torch are imported: sums depend on how many threads share them
@@ -15,6 +16,11 @@ _SETTINGS = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("search", **_SETTINGS)
 settings.register_profile("same", **_SETTINGS, derandomize=True, database=None)
 settings.load_profile("same")
+
+
+def pytest_collection_finish():
+    """What has been imported stays: no collection of garbage has to look through it again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
