@@ -23,9 +23,9 @@ def pytest_collection_finish():
     gc.freeze()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def dask_cluster(tmp_path_factory):
-    """Two workers on this machine, which import the tests as this process does."""
+    """Two workers on this machine, which import the tests as this process does. They cost time while they are idle, too."""
     distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
     folder = str(tmp_path_factory.mktemp("dask"))
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=":0", local_directory=folder) as started:
