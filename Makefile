@@ -38,7 +38,7 @@ demo: install  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some
 	$(BIN)/python -m benchmarks.demo
 
 test: install  ## all tests
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal  # neighbours share their fixtures, and no worker is idle in the end
 
 test-oldest:  ## those of both packages, with the oldest versions that setup.cfg names of all but torch
 	$(PYTHON) -m venv --clear $(VENV)/oldest
@@ -46,7 +46,7 @@ test-oldest:  ## those of both packages, with the oldest versions that setup.cfg
 	$(VENV)/oldest/bin/python -m pip install --quiet $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)"
 	VIRTUAL_ENV=$(VENV)/oldest $(VENV)/oldest/bin/uv pip install --quiet --resolution lowest-direct \
 		"$(TORCH)" ./battery_env ".[$(EXTRAS)]" "pyparsing==3.2.0"  # later ones warn of old versions of matplotlib
-	$(VENV)/oldest/bin/python -m pytest -n 2 tests/battery_env tests/sb3_lac
+	$(VENV)/oldest/bin/python -m pytest -n 2 --dist worksteal tests/battery_env tests/sb3_lac
 
 format: install  ## black, and what ruff can mend
 	$(BIN)/python -m ruff check --fix $(SOURCES)

@@ -1,5 +1,6 @@
 """What makes the tests say the same on every machine."""
 
+import gc
 import os
 
 # Before numpy and torch are imported: sums depend on how many threads share them
@@ -17,9 +18,14 @@ settings.register_profile("same", **_SETTINGS, derandomize=True, database=None)
 settings.load_profile("same")
 
 
-@pytest.fixture(scope="session")
+def pytest_collection_finish():
+    """What has been imported stays: no collection of garbage has to look through it again."""
+    gc.freeze()
+
+
+@pytest.fixture(scope="module")
 def dask_cluster(tmp_path_factory):
-    """Two workers on this machine, which import the tests as this process does."""
+    """Two workers on this machine, which import the tests as this process does. They cost time while they are idle, too."""
     distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
     folder = str(tmp_path_factory.mktemp("dask"))
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=":0", local_directory=folder) as started:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,7 @@ def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | Flo
     """
     # as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
     # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
-    x = Polynomial([0.5, 0.5])
-    powers = Legendre(coefficients_V).convert(kind=Polynomial)(on_unit_range(x)).coef
+    powers = np.asarray(coefficients_V, dtype=np.float64) @ _powers(len(coefficients_V))
     terms = np.zeros(max(len(cell.Ap), len(powers) - 1))
     for k in range(len(powers) - 2, -1, -1):
         terms[k] = powers[k + 1] / (1.0 + k / 2.0)
@@ -32,6 +32,14 @@ def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | Flo
             powers[k - 1] += k / 2.0 * terms[k]
     terms[: len(cell.Ap)] += np.array(cell.Ap) / cell.F
     return cell.replace(U0p=cell.U0p + float(powers[0]), Ap=tuple((cell.F * terms).tolist()))
+
+
+@cache
+def _powers(count: int) -> FloatArray:
+    # of y = 2x - 1 in each of the first Legendre polynomials, shape (count, count)
+    x = Polynomial([0.5, 0.5])
+    rows = [Legendre.basis(k).convert(kind=Polynomial)(on_unit_range(x)).coef for k in range(count)]
+    return np.array([np.append(row, np.zeros(count - len(row))) for row in rows])
 
 
 def equilibrium_slopes(fraction_p: FloatArray, count: int) -> FloatArray:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import truncnorm
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_not_negative, check_positive, check_whole_number
@@ -344,6 +343,8 @@ def _draw_parameters(
         )
     deviation = np.zeros(samples)
     if share > 0.0:
+        from scipy.stats import truncnorm  # slow to import, and a whole discharge needs none
+
         deviation = truncnorm.rvs(low / share, high / share, size=samples, random_state=rng)
     # at a given voltage a larger q_mobile goes with a larger r_o
     _, by_q, by_r = model.sensitivities(current_A, max(q_C, 1.01 * least_C), r_ohm)

@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
-from scipy.stats import truncnorm
 
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
@@ -145,6 +144,8 @@ class Life:
         check_positive("threshold_Ah", threshold_Ah)
         last = self.table[self.table["valid"]].iloc[-1]
         end = log(threshold_Ah * last["q_mobile_C"] / last["capacity_Ah"])
+        from scipy.stats import truncnorm  # slow to import, and nothing else here needs it
+
         rng = np.random.default_rng(check_whole_number("seed", seed))
         (level_mean, drift_mean), ((p_level, p_both), (_, p_drift)) = self.state, self.covariance
         drift_sd = sqrt(p_drift)

@@ -41,6 +41,8 @@ from battery_env.tasks.voltage.task import VoltageTask
 
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
+# Of a decision that is not judged.
+_NOT_JUDGED = Verdict(False, False, Condition.NOT_YET.text)
 
 
 class Predictor(Protocol):
@@ -161,7 +163,7 @@ class PolicyEstimator(OnlineEstimator):
     def _judge(self) -> None:
         """Tell how sure the estimate is, of the samples up to the last decision."""
         self._sd, self._found = [nan, nan], None
-        self._verdict = Verdict(False, False, (Condition.NO_FIT if self._confidence is None else Condition.NOT_YET).text)
+        self._verdict = Verdict(False, False, Condition.NO_FIT.text) if self._confidence is None else _NOT_JUDGED
         if self._confidence is not None and self._fitted is not None:
             samples = with_voltage(self._samples, self._decisions * self.decision_s)
             (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
@@ -273,7 +275,7 @@ class PolicyEstimator(OnlineEstimator):
         :raises ValueError: for an invalid record
         """
         check_drawn_charge(drawn_charge_C(check_record(record)))
-        trace = self.trace([record])[0]
+        trace = self._traces([record], judge_last_only=True)[0]
         if trace.sd_q_mobile is not None:
             return last_estimate(trace)
         first = 0 if self.task_class.is_averaged else -1
@@ -282,6 +284,10 @@ class PolicyEstimator(OnlineEstimator):
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """The estimates over time of many discharges, run as one batch, in their order."""
+        return self._traces(records)
+
+    def _traces(self, records: Sequence[Record], judge_last_only: bool = False) -> list[EstimateTrace]:
+        """Those of :meth:`trace`; a verdict takes longer than a decision, and may be left to the last of each discharge."""
         task = self._follow(records, self.decision_s)
         samples = [] if self._confidence is None else [(Samples.of(record), shown_beside(record)) for record in records]
         made: list[FloatArray] = []
@@ -296,7 +302,12 @@ class PolicyEstimator(OnlineEstimator):
             if self._confidence is not None and fitted is not None:
                 sd = self._confidence.standard_deviations(fitted, estimate)
                 columns.append(sd)
+                is_open = judge_last_only & ~task.truncated()
                 for n in np.flatnonzero(running).tolist():
+                    if is_open[n]:
+                        verdicts.append(_NOT_JUDGED)
+                        found.append(None)
+                        continue
                     record, shown = samples[discharge[n]]
                     so_far = record.first(int(np.searchsorted(record.time_s, time_s[n], side="right")))
                     verdicts.append(self._confidence.verdict(fitted, n, estimate[n], so_far, shown))
@@ -312,6 +323,6 @@ class PolicyEstimator(OnlineEstimator):
         texts = np.array([each.reason for each in verdicts], dtype=object)
         said = (settled_q & settled_r_o, texts, settled_q, settled_r_o)
         traces = [EstimateTrace(*rows[n, 1:4].T, *rows[n, 4:6].T, *(column[n] for column in said)) for n in of_each]
-        if found[0] is None:
+        if found[-1] is None:
             return traces
         return [replace(trace, constants=[found[k] for k in n]) for trace, n in zip(traces, of_each, strict=True)]

@@ -1,6 +1,7 @@
 """The page for the bench, in Streamlit's test of pages."""
 
 import io
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,12 @@ def folder(tmp_path):
         (tmp_path / f"{number}.csv").write_text(csv(discharge), encoding="utf-8")
     (tmp_path / "notes.csv").write_text("who,what\nme,tea\n", encoding="utf-8")
     return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def _same_program(monkeypatch):
+    """Streamlit leaves its page as the program, which workers that other tests start would run."""
+    monkeypatch.setitem(sys.modules, "__main__", sys.modules["__main__"])
 
 
 @pytest.fixture

@@ -87,14 +87,14 @@ def undisturbed(lab, tmp_path_factory):
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="it looks for processes as Linux has them")
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, "worker"])
-def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed, tmp_path):
+def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed, tmp_path, capsys):
     arguments = (lab, "--out", tmp_path, "--table-only", "--jobs", 2)
     process = started(*arguments)
     wait_for(lambda: rows_in(tmp_path) >= 3)
     others = workers_of(process.pid)
     assert len(others) == 2
     os.kill(others[0] if end == "worker" else process.pid, signal.SIGKILL if end == "worker" else end)
-    out, error = process.communicate(timeout=120)
+    _, error = process.communicate(timeout=120)
     wait_for(lambda: not any(map(is_alive, others)))
     if end == "worker":  # one takes its place
         assert process.returncode == 0, error
@@ -104,10 +104,10 @@ def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed,
         assert 3 <= done < ROWS
         if end == signal.SIGTERM:
             assert b"the same command goes on" in error and len(pd.read_csv(tmp_path / "estimate.csv")) == done
-        process = started(*arguments[:-2])
-        out, error = process.communicate(timeout=120)
-        assert process.returncode == 0 and f"going on: {done} discharges are done".encode() in error
-        assert out.count(b"\nc") == ROWS - 1 and b"12 discharges: 12 settled" in out
+        assert main(["calibrate", *map(str, arguments[:-2])]) == 0
+        shown = capsys.readouterr()
+        assert f"going on: {done} discharges are done" in shown.err
+        assert shown.out.count("\nc") == ROWS - 1 and "12 discharges: 12 settled" in shown.out
     assert (tmp_path / "estimate.csv").read_bytes() == undisturbed
 
 
@@ -120,15 +120,15 @@ def test_a_call_that_its_process_does_not_survive_is_an_error_and_all_others_are
         assert list(in_order(pool, 4, squared_unless_it_ends_its_process, [(3, ())])) == [((3, ()), (9, [], ""))]
 
 
-def test_of_two_commands_on_one_folder_one_is_refused_and_no_row_is_lost(lab, undisturbed, tmp_path):
+def test_of_two_commands_on_one_folder_one_is_refused_and_no_row_is_lost(lab, undisturbed, tmp_path, capsys):
     first = started(lab, "--out", tmp_path, "--table-only")
     wait_for(lambda: rows_in(tmp_path))
     first.send_signal(signal.SIGSTOP)  # as slow as it takes
-    second = started(lab, "--out", tmp_path, "--table-only")
-    assert b"is being written by another command: wait for it, or choose another --out" in second.communicate(timeout=120)[1]
+    assert main(["calibrate", str(lab), "--out", str(tmp_path), "--table-only"]) == 2
+    assert "is being written by another command: wait for it, or choose another --out" in capsys.readouterr().err
     first.send_signal(signal.SIGCONT)
     first.communicate(timeout=120)
-    assert (first.returncode, second.returncode) == (0, 2)
+    assert first.returncode == 0
     assert (tmp_path / "estimate.csv").read_bytes() == undisturbed
     with locked(tmp_path / "c1_estimate.jsonl"):  # of another file
         assert main(["calibrate", f"{lab}/c2.csv", "--out", str(tmp_path), "--table-only"]) == 0
@@ -277,7 +277,7 @@ def a_bomb(path):
         opened = archive.open("xl/record.csv" if path.suffix == ".xlsx" else "record.csv", "w", force_zip64=True)
     with opened as stream:
         stream.write(header)
-        for _ in range(20):
+        for _ in range(6):
             stream.write(row)
     if path.suffix in (".zip", ".xlsx"):
         archive.close()

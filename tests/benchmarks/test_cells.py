@@ -44,6 +44,13 @@ def test_fitted_constants_are_better_on_the_other_cell(tmp_path):
     assert set(constants["fitted_to"]) == {"B0005", "B0006"} and (constants["sd"] <= constants["prior_sd"]).all()
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _few_simulations():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cells, "N_CELLS", 20)
+        yield
+
+
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("own_cell")

@@ -30,12 +30,17 @@ LinearCost-v0:
 """
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _nothing_left_open():
+    """What tests of other modules have left open is not of these."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        gc.collect()
+
+
 @pytest.fixture(autouse=True)
 def trainings(tmp_path, monkeypatch):
     """Tiny networks, whose environments are closed in the end, and a list of the seeds that were trained with."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        gc.collect()  # what tests of other modules have left open is not of these
     (tmp_path / "zoo_configs").mkdir()
     (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)

@@ -32,6 +32,16 @@ def _quick_backend(monkeypatch):
     th.compiler.reset()
 
 
+@pytest.fixture
+def make_model(make_model):
+    """Of one small layer, whose graph is soon traced, unless asked otherwise."""
+
+    def _make_model(*args, policy_kwargs=None, **kwargs):
+        return make_model(*args, policy_kwargs={"net_arch": [8], **(policy_kwargs or {})}, **kwargs)
+
+    return _make_model
+
+
 def trained(model, calls=3, gradient_steps=2):
     """The model after updates on the same batches whatever the model, and what it logged."""
     np.random.seed(0)
@@ -92,7 +102,12 @@ def seen(env):
         {"ent_coef": 0.2, "reward_bound": 3.0, "n_steps": 3},
         {"algorithm": PublishedLAC, "reward_bound": 3.0, "critic_learning_rate": LinearSchedule(1e-2, 1e-3, 1.0)},
         {"algorithm": PublishedLAC, "horizon": 4, "ent_coef": 0.2},
-        {"policy_kwargs": {"n_critics": 2, "optimizer_class": th.optim.SGD, "share_features_extractor": True}},
+        {
+            "policy_kwargs": {
+                **{"net_arch": [16, 16], "n_critics": 2},
+                **{"optimizer_class": th.optim.SGD, "share_features_extractor": True},
+            }
+        },
         {"policy": "MultiInputPolicy", "wrapper": seen},
     ],
     ids=["schedules", "n_steps", "published", "horizon", "two_critics", "images_and_discrete"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -226,16 +227,16 @@ def found_size(unknowns: int) -> int:
     return 2 * unknowns + 3
 
 
+@lru_cache(maxsize=4)
 def _added_by_equilibrium(cell: CellParameters, count: int) -> FloatArray:
     # what each coefficient adds to U0 and to the polynomial of the positive electrode, shape (count, 1 + POLYNOMIAL_SIZE)
     def packed(coefficients_V: FloatArray) -> FloatArray:
         made = with_equilibrium(cell, coefficients_V).packed
         return np.append(made.constants[0, U0], made.polynomial_p)
 
-    nothing = np.zeros(EQUILIBRIUM_SIZE)
-    return np.array([packed(row) - packed(nothing) for row in np.eye(EQUILIBRIUM_SIZE)[:count]]).reshape(
-        count, 1 + POLYNOMIAL_SIZE
-    )
+    without = packed(np.zeros(EQUILIBRIUM_SIZE))
+    added = [packed(row) - without for row in np.eye(EQUILIBRIUM_SIZE)[:count]]
+    return np.array(added).reshape(count, 1 + POLYNOMIAL_SIZE)
 
 
 @compiled
