@@ -178,7 +178,7 @@ def declared(distributions, extras):
     [
         ("battery_env", ("battery_env",), ("cluster", "cyclers", "onnx", "page", "parquet", "sb3")),
         ("sb3_lac", (".",), ("zoo", "onnx")),
-        ("benchmarks", ("battery_env", "."), ("zoo", "peers")),
+        ("benchmarks", ("battery_env", "."), ("zoo", "peers", "pybop")),
         ("tests", ("battery_env", "."), ("zoo", "peers", "onnx", "dev")),
     ],
 )

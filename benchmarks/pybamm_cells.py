@@ -1,0 +1,190 @@
+"""
+Cells of other equations: lives of five cells, iron phosphate among them, that PyBaMM simulates (single particle model with
+electrolyte), looked at as a lab does with its own.
+
+.. code-block:: bash
+
+  pip install pybamm
+  python -m benchmarks.pybamm_cells
+
+A cell is worn from discharge to discharge: it loses active material on both sides, and its contacts get worse. Every fourth
+discharge has a current that changes each minute, the others a constant one. Constants are fitted to three discharges at a
+constant current and two at a varying one, over the life. Of each other discharge the first 25, 50 and 75 % of the time are
+seen: when will it end, by the fit alone, and by the six discharges before as well? That an end keeps to what a cell holds over
+its life was found on these cells; no number was chosen on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from battery_env import Discharge, Settings, calibrate, fit_cell, track_life
+from battery_env.arrays import FloatArray
+from battery_env.lab.running import forecast_end
+from battery_env.loads import Load
+from battery_env.plotting import coloured
+from benchmarks.study import (
+    Cell,
+    Study,
+    Tables,
+    command_line,
+    markdown,
+    natural,
+    new_panels,
+    share_in_percent,
+    side_by_side,
+    table_of,
+)
+
+#: Parameter sets of PyBaMM, and what readers call them.
+CELLS = {
+    "Chen2020": "LG M50, NMC 811, 5 Ah",
+    "Mohtat2020": "pouch, NMC 532, 5 Ah",
+    "Ai2020": "Enertech, LCO, 2.3 Ah",
+    "Marquis2019": "Kokam, LCO, 0.7 Ah",
+    "Prada2013": "A123, LFP, 2.3 Ah",
+}
+SHARES = (0.25, 0.5, 0.75)
+DISCHARGES, BEFORE = 24, 6
+#: Those that constants are fitted to.
+FITTED = (0, 7, 10, 19, 22)
+FIT, LIFE = "the fit", "the fit and six discharges before"
+#: Constant current, and range of one that varies, over the nominal capacity, 1/h.
+RATE, RATES, MINUTE_S = 0.8, (0.3, 1.3), 60.0
+#: What a life takes of the active material of the negative and the positive electrode, and how many times larger contacts get.
+LOST, CONTACT, CONTACT_GROWTH = (0.15, 0.10), 0.025, 3.0
+#: Sampling, s, and noise: V, and a share of the capacity over an hour.
+SAMPLING_S, NOISE_V, NOISE_A = 10.0, 0.001, 2e-4
+
+
+class SimulatedLife(NamedTuple):
+    """A life, and where its discharges end."""
+
+    discharges: list[Discharge]
+    cut_off_V: float
+
+
+def varies(n: int) -> bool:
+    """Whether the current of a discharge does."""
+    return n % 4 == 3
+
+
+def simulated(name: str, seed: int) -> SimulatedLife:
+    """The life of a cell."""
+    import pybamm  # here, as it is no requirement of the tests
+
+    pybamm.set_logging_level("ERROR")
+    rng, new, made = np.random.default_rng(seed), pybamm.ParameterValues(name), []
+    capacity_Ah, cut_off_V = float(new["Nominal cell capacity [A.h]"]), float(new["Lower voltage cut-off [V]"])
+    is_thermal = "Negative current collector thickness [m]" in new
+    options = {"contact resistance": "true", "thermal": "lumped" if is_thermal else "isothermal"}
+    for n in range(DISCHARGES):
+        worn, age = new.copy(), n / (DISCHARGES - 1)
+        for side, lost in zip(("Negative", "Positive"), LOST, strict=True):
+            worn[f"{side} electrode active material volume fraction"] *= 1.0 - lost * age
+        worn["Contact resistance [Ohm]"] = CONTACT / capacity_Ah * (1.0 + CONTACT_GROWTH * age)
+        if varies(n):
+            starts_s = np.arange(0.0, 400.0 * MINUTE_S, SAMPLING_S)
+            levels_A = capacity_Ah * np.repeat(rng.uniform(*RATES, 400), int(MINUTE_S / SAMPLING_S))
+            drive: Any = np.column_stack([starts_s, levels_A])
+            ends = f"< {cut_off_V}V"
+        else:
+            drive, ends = RATE * capacity_Ah, f"{cut_off_V}V"
+        often = f"{SAMPLING_S:g} seconds"
+        rest = pybamm.step.rest("5 minutes", period=often)
+        steps = [rest, pybamm.step.current(drive, termination=ends, period=often), rest]
+        model = pybamm.lithium_ion.SPMe(options)
+        solution = pybamm.Simulation(model, parameter_values=worn, experiment=pybamm.Experiment(steps)).solve(initial_soc=1.0)
+        columns = [np.asarray(solution[each].entries) for each in ("Time [s]", "Terminal voltage [V]", "Current [A]")]
+        # a step begins when the one before ends
+        time_s, voltage_V, current_A = np.array(columns)[:, np.append(True, np.diff(columns[0]) > 1e-6)]
+        voltage_V = voltage_V + rng.normal(0.0, NOISE_V, len(time_s))
+        current_A = current_A + rng.normal(0.0, NOISE_A * capacity_Ah, len(time_s)) * (current_A > 0.0)
+        made.append(Discharge(time_s, voltage_V, current_A))
+    return SimulatedLife(made, cut_off_V)
+
+
+def to_come(discharge: Discharge, seen: Discharge) -> Load:
+    """The current that was measured after what was seen."""
+    later = (discharge.time_s >= seen.time_s[-1]) & (discharge.current_A > 0.0)
+    return Load(discharge.time_s[later] - discharge.time_s[later][0], discharge.current_A[later], "current")
+
+
+def part(cell: str, seed: int) -> Tables:
+    """A cell: simulate its life, fit it, and forecast the discharges that were not fitted."""
+    life, cut_off_V = simulated(cell, seed)
+    fit = fit_cell([life[n] for n in FITTED if n < DISCHARGES], cut_off_V)
+    settings = Settings.for_cell(fit)
+    rows: list[dict[str, Any]] = []
+    for n, discharge in enumerate(life):
+        if n in FITTED or n < BEFORE:
+            continue
+        found = calibrate(discharge, settings)
+        common = {"cell": cell, "discharge": n, "varies": varies(n), "seed": seed, "fit_rmse_V": fit.rmse_V}
+        rows.append({**common, "knows": FIT, "share": 1.0, "settled": float(found.settled_q_mobile)})
+        before = track_life(life[n - BEFORE : n], cut_off_V, fit.calibrator())
+        start_s, end_s = discharge.load_on_time_s, discharge.eod_time_s(cut_off_V)
+        for share in SHARES:
+            seen = discharge.until(start_s + share * (end_s - start_s))
+            load = to_come(discharge, seen) if varies(n) else None
+            for knows, own in ((FIT, None), (LIFE, before)):
+                quantiles_s = forecast_end(seen, settings, load, life=own).eod_quantile_s()
+                rows.append({**common, "knows": knows, "share": share, **_end(quantiles_s, start_s, end_s)})
+    return {"pybamm_cells": pd.DataFrame(rows)}
+
+
+def _end(quantiles_s: FloatArray, start_s: float, end_s: float) -> dict[str, float]:
+    low, middle, high = 100.0 * (quantiles_s - end_s) / (end_s - start_s)
+    return {"error_percent": middle, "width_percent": high - low, "inside": float(low <= 0.0 <= high)}
+
+
+def summary(rows: pd.DataFrame) -> pd.DataFrame:
+    """One line a cell and what is known of it."""
+
+    def over_shares(column: str, how: str) -> Cell:
+        return lambda group: side_by_side(group.groupby("share")[column].agg(how).dropna())
+
+    shown = rows.assign(error=rows["error_percent"].abs(), cell=rows["cell"].map(CELLS), inside=100.0 * rows["inside"])
+    cells: dict[str, Cell] = {
+        "end at 25 / 50 / 75 %: mean error (%)": over_shares("error", "mean"),
+        "worst (%)": over_shares("error", "max"),
+        "inside 90 % (%)": over_shares("inside", "mean"),
+        "width of the interval (%)": over_shares("width_percent", "mean"),
+        "whole: settled (%)": lambda group: share_in_percent(whole) if len(whole := group["settled"].dropna()) else "",
+    }
+    return table_of(shown, ["cell", "knows"], cells)
+
+
+def plot(rows: pd.DataFrame) -> Figure:
+    """The error of the end and its interval after half of the time, over the life of each cell."""
+    half = rows[rows["share"] == 0.5]
+    figure, panels = new_panels(len(CELLS), 3, (3.4, 3.0))
+    for axes, (cell, of_cell) in zip(panels, half.groupby("cell", sort=False), strict=False):
+        for colour, (knows, group) in coloured(of_cell.groupby("knows", sort=False)):
+            error, width = group["error_percent"], 0.5 * group["width_percent"]
+            axes.errorbar(group["discharge"], error, width, fmt=".", color=colour, lw=0.8, label=knows)
+        axes.axhline(0.0, color="black", lw=0.6)
+        axes.set(title=CELLS[str(cell)], xlabel="discharge", ylabel="error of the end, half seen (%)")
+    panels[0].legend(frameon=False, fontsize=7)
+    return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = command_line("pybamm_cells", __doc__)
+    parser.add_argument("--seeds", type=natural, nargs="+", default=[0, 1, 2, 3, 4], help="of loads and noise")
+    parser.add_argument("--cells", nargs="+", default=list(CELLS), choices=CELLS)
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    tables = study.run(part, [{"cell": cell, "seed": seed} for cell in chosen.cells for seed in chosen.seeds])
+    rows = tables["pybamm_cells"]
+    study.write(tables, {"pybamm_cells": plot(rows[rows["seed"] == chosen.seeds[0]])}, markdown(summary(rows)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""The study of cells of other equations, on cells of our own, and the lives that PyBaMM simulates."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from battery_env import Discharge, simulate
+from battery_env.electrochemistry import NEW_CELL
+from benchmarks import pybamm_cells
+from benchmarks.pybamm_cells import FIT, LIFE, SHARES, SimulatedLife, varies
+
+
+def life(name, seed):
+    rng, made = np.random.default_rng(seed), []
+    for n in range(pybamm_cells.DISCHARGES):
+        load = 2.0 if not varies(n) else np.repeat(rng.uniform(0.7, 3.0, 300), 60)
+        made.append(simulate(load, 7000.0 - 60.0 * n, 0.1 + 0.003 * n, load_unit="current", cell=NEW_CELL.replace(VEOD=2.4)))
+    return SimulatedLife([Discharge(each.time_s[::5], each.voltage_V[::5], each.current_A[::5]) for each in made], 2.7)
+
+
+def test_what_is_known_of_a_cell_brings_its_end_nearer(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(pybamm_cells, "simulated", life)
+    monkeypatch.setattr(pybamm_cells, "DISCHARGES", 12)
+    asked = ["--cells", "Ai2020", "--seeds", "1", "--jobs", "1", "--out", str(tmp_path)]
+    pybamm_cells.main(asked)
+    rows = pd.read_csv(tmp_path / "pybamm_cells.csv")
+    # discharges 6, 8, 9 and 11 are tested
+    assert len(rows) == 4 * (1 + 2 * len(SHARES)) and rows["varies"].sum() == 1 + 2 * len(SHARES)
+    ends = rows[rows["share"] < 1.0]
+    assert ends["inside"].all() and rows["settled"].dropna().all()
+    narrow, wide = (ends[ends["knows"] == each] for each in (LIFE, FIT))
+    assert narrow["width_percent"].max() < 0.5 * wide["width_percent"].max() and narrow["error_percent"].abs().max() < 2.0
+    text = (tmp_path / "pybamm_cells.md").read_text()
+    assert "| Enertech, LCO, 2.3 Ah | the fit " in text and text in capsys.readouterr().out
+    pybamm_cells.main([*asked, "--redraw"])
+    assert (tmp_path / "pybamm_cells.md").read_text() == text
+
+
+def test_lives_wear_out_and_are_drawn_from_their_seed(monkeypatch):
+    pytest.importorskip("pybamm")
+    monkeypatch.setattr(pybamm_cells, "DISCHARGES", 5)
+    lives = [pybamm_cells.simulated("Ai2020", seed) for seed in (0, 0, 1)]
+    charges_C = [each.charge_C for each in lives[0].discharges if not np.ptp(each.current_A[each.current_A > 0.0]) > 0.5]
+    assert len(charges_C) == 4 and (np.diff(charges_C) < 0.0).all()
+    again, other = (np.array_equal(each.discharges[3].voltage_V, lives[0].discharges[3].voltage_V) for each in lives[1:])
+    assert again and not other
