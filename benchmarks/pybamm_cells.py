@@ -128,7 +128,7 @@ def part(cell: str, seed: int) -> Tables:
         common = {"cell": cell, "discharge": n, "varies": varies(n), "seed": seed, "fit_rmse_V": fit.rmse_V}
         rows.append({**common, "knows": FIT, "share": 1.0, "settled": float(found.settled_q_mobile)})
         before = track_life(life[n - BEFORE : n], cut_off_V, fit.calibrator())
-        start_s, end_s = discharge.load_on_time_s, discharge.eod_time_s(cut_off_V)
+        start_s, end_s = discharge.loaded_part(cut_off_V).time_s[[0, -1]].tolist()
         for share in SHARES:
             seen = discharge.until(start_s + share * (end_s - start_s))
             load = to_come(discharge, seen) if varies(n) else None

@@ -260,6 +260,10 @@ class CellParameters:
 
 #: The new cell: every constant at its default.
 NEW_CELL = CellParameters()
+#: The charge that can move is about this much more than what a discharge delivers.
+UNDELIVERED = 1.05
+# A cell that holds less or more than the new one by this factor is one of another size.
+_OTHER_SIZE = 2.0
 
 
 def rest_shares(soc: float = 1.0) -> FloatArray:
@@ -287,3 +291,8 @@ def check_dt(dt: float, cell: CellParameters) -> float:
             f"unstable beyond), got {dt!r}. Use a smaller dt."
         )
     return float(dt)
+
+
+def is_other_size(q_mobile_C: float) -> bool:
+    """Whether a cell is so much smaller or larger than a new 18650 that this one's surfaces are none of its own."""
+    return not 1.0 / _OTHER_SIZE < q_mobile_C / NEW_CELL.q_mobile < _OTHER_SIZE

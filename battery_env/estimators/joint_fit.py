@@ -13,6 +13,7 @@ import numpy as np
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
+from battery_env.electrochemistry.cell import UNDELIVERED, is_other_size
 from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
@@ -50,10 +51,6 @@ LIMIT_V = 0.05
 _MOST_DISCHARGES, _FEWEST_SAMPLES = 30, 20
 # Longer records are thinned: what the constants shape is slower.
 _MOST_SAMPLES = 2000
-# A cell that holds less or more than the new one by this factor is one of another size.
-_OTHER_SIZE = 2.0
-# The charge that can move is about this much more than what a discharge delivers.
-_UNDELIVERED = 1.05
 # Rounds of weighing the residuals by how large they turn out, and how large they are taken for in the first one, V.
 _ROUNDS = 3
 _FIRST_MISMATCH_V, _LEAST_MISMATCH_V = 0.02, 1e-3
@@ -180,11 +177,11 @@ def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> N
 def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
     """Return what is thought of the constants before the data, but for what is measured."""
     check_cell(start, thermal)
-    q_mobile = float(Q_MOBILE.check(_UNDELIVERED * max(drawn_charge_C(record) for record in records)))
+    q_mobile = float(Q_MOBILE.check(UNDELIVERED * max(drawn_charge_C(record) for record in records)))
     if start is None:
         size = q_mobile / NEW_CELL.q_mobile
         start = NEW_CELL
-        if not 1.0 / _OTHER_SIZE < size < _OTHER_SIZE:
+        if is_other_size(q_mobile):
             surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
             start = NEW_CELL.replace(q_mobile=q_mobile, r_o=NEW_CELL.r_o / size, **surfaces)
     known = [getattr(record, "temperature_C", None) for record in records]

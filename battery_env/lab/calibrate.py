@@ -139,11 +139,12 @@ _GOES_ON = Ahead()
 def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON) -> Calibration:
     """What one discharge says, and of one in progress what comes after it."""
     seen = _look_at(discharge, settings)
-    estimate, method, model, now = _estimate(seen, settings, ahead.load)
+    known = settings.in_progress() if seen.in_progress else settings
+    estimate, method, model, now = _estimate(seen, known, ahead.load)
     # a cell in progress has not ended, however low its model comes in the pulses before
     limits = (-np.inf, 0.0) if seen.in_progress else (settings.cut_off_V, seen.future.mean_A)
     shown = model.forecast(seen.record, estimate, *limits)
-    end = _end(seen, estimate, replace(settings, method=method), now or model, shown, ahead)
+    end = _end(seen, estimate, replace(known, method=method), now or model, shown, ahead)
     end_C, model_end_C = _end_temperatures(seen.record, shown)
     charge = _charge(seen, settings, estimate, end)
     if seen.start.reason or seen.more_C or not _is_all_logged(seen, shown, estimate):
@@ -281,7 +282,7 @@ def _notes(seen: _Seen, estimate: Estimate, settings: Settings, shown: VoltageFo
     if float(seen.discharge.time_s[-1]) > seen_s:
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
     if settings.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
-        yield "The filter expects a cell of some 2 Ah: of another one give the life, a prior of q_max or the constants."
+        yield "The filter expects a cell of some 2 Ah: of another one give the nominal capacity, the life, q_max or constants."
     if rmse_V > settings.mismatch_V:
         text = f"The model misses the voltage by {1e3 * rmse_V:.0f} mV (RMSE), more than mismatch_V."
         yield f"{text} Other loads make the interval too narrow."

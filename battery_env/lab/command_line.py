@@ -190,7 +190,7 @@ _CALIBRATION: _Options = {
         "type": float,
         "metavar": "AH",
         "help": "nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this "
-        "load)",
+        "load); it also tells what to expect of a cell in progress that is below 1 or above 4 Ah",
     },
     ("--ambient",): {
         "dest": "ambient_C",

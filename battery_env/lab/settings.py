@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -12,10 +12,11 @@ import numpy as np
 from battery_env.checks import check_not_negative, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
+from battery_env.electrochemistry.cell import UNDELIVERED, is_other_size
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.diagnosis.conditions import Condition
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
-from battery_env.estimators.kalman import ExtendedKalmanFilter
+from battery_env.estimators.kalman.filter import PRIOR_SD_SHARE_Q, ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.parameters import PARAMETER_NAMES, check_parameters
 from battery_env.policies.estimator import PolicyEstimator
@@ -57,7 +58,8 @@ class Settings:
     :param ambient_C: temperature at the start and of the surroundings, degC; ``None``: the first one measured, or what
         else the record says of its surroundings, or the cell's
     :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: the charge that ``cell``, with its
-        own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``
+        own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``.
+        Where nothing else is known, it tells the ``q_mobile`` of a cell of another size than a new 18650, in progress
     :param cell: constants of the model; ``None``: those of a new 18650
     :param cell_currents_A: lowest and highest mean current that these constants were fitted to, A: beyond them by more than a
         quarter no estimate is settled, and no nominal capacity is told. ``None``: they hold for all
@@ -150,6 +152,16 @@ class Settings:
             known = {"cut_off_V": cell.cell.VEOD, "mismatch_V": cell.mismatch_V, "thermal": False, "path": cell}
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
+
+    def in_progress(self) -> Settings:
+        """These settings for a discharge in progress: a nominal capacity tells about how much a cell of another size holds."""
+        is_known = self.prior_q_mobile_C is not None or self.cell is not None or "q_mobile" not in self.parameters
+        if self.nominal_Ah is None or is_known or self.method == "policy":
+            return self
+        q_mobile_C = UNDELIVERED * 3600.0 * self.nominal_Ah
+        return (
+            replace(self, prior_q_mobile_C=(q_mobile_C, PRIOR_SD_SHARE_Q * q_mobile_C)) if is_other_size(q_mobile_C) else self
+        )
 
     def other_load(self, current_A: float) -> str:
         """Why the constants may not hold for a mean current; empty if they do."""

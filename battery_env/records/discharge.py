@@ -220,11 +220,12 @@ class Discharge:
 
     def _ends_at(self, cut_off_V: float) -> bool:
         """
-        Whether the last sample under load is as near to the cut-off as the one before it is to that sample: a tester stops by
-        a reading that it need not write.
+        Whether the last sample under load is as near to the cut-off as the one an interval before it is to that sample: a
+        tester stops by a reading that it need not write. The row of the end itself may lie just behind a regular one.
         """
-        last = self._loaded[1]
-        before = max(last - 1, 0)
+        first, last = self._loaded
+        interval_s = float(np.median(np.diff(self.time_s[first : last + 1]))) if last > first else 0.0
+        before = max(int(np.searchsorted(self.time_s, self.time_s[last] - 0.5 * interval_s)) - 1, 0)
         is_steady = abs(self.current_A[last] - self.current_A[before]) <= SWITCH_SHARE * self.current_A.max()
         fall_V = self.voltage_V[before] - self.voltage_V[last]
         return bool(is_steady and fall_V > 0.0 and self.voltage_V[last] - cut_off_V <= fall_V)
@@ -256,7 +257,7 @@ class Discharge:
     def eod_time_s(self, cut_off_V: float) -> float:
         """
         When the voltage under load first fell to the cut-off, interpolated between the two samples around it. A load that ends
-        above it by no more than the last fall between two samples ends there.
+        above it by no more than the fall over the last interval of the samples ends there.
 
         :param cut_off_V: cut-off voltage, V
         :return: the end of discharge on the clock of ``time_s``, s; NaN if the record does not reach it
@@ -265,10 +266,10 @@ class Discharge:
         n = self._first_below(cut_off_V)
         if n is None:
             return float("nan")
-        if n == self._loaded[0]:
+        if n == self._loaded[0] or self.voltage_V[n] > cut_off_V:
             return float(self.time_s[n])
         share = (self.voltage_V[n - 1] - cut_off_V) / (self.voltage_V[n - 1] - self.voltage_V[n])
-        return float(self.time_s[n - 1] + min(share, 1.0) * (self.time_s[n] - self.time_s[n - 1]))
+        return float(self.time_s[n - 1] + share * (self.time_s[n] - self.time_s[n - 1]))
 
     def loaded_part(self, cut_off_V: float) -> Discharge:
         """

@@ -130,6 +130,17 @@ class TestDischarge:
         spliced = np.append(np.linspace(3.9, 2.65, 20), np.linspace(3.9, 2.65, 20))
         assert Discharge(time_s, spliced, np.full(40, 2.0)).eod_time_s(2.7) == pytest.approx(182.4, abs=0.1)
 
+    @pytest.mark.parametrize("behind_s", [0.02, 0.2, 2.0, 4.0])
+    @pytest.mark.parametrize("noise_V", [0.0, 0.001, -0.001])
+    def test_the_row_of_the_end_may_lie_just_behind_a_regular_one(self, behind_s, noise_V):
+        time_s = np.append(10.0 * np.arange(40), 390.0 + behind_s)
+        voltage_V = 2.7 + 0.001 + 0.003 * (time_s[-1] - time_s) + 0.5 * (np.arange(41) < 2)
+        voltage_V[-1] += noise_V
+        record = Discharge(time_s, voltage_V, np.where(np.arange(41) < 2, 0.0, 2.0))
+        assert record.eod_time_s(2.7) == pytest.approx(time_s[-1], abs=0.1)
+        # nor is one that ends a fall above it
+        assert np.isnan(record.eod_time_s(2.6))
+
     def test_loaded_part_runs_from_the_switch_to_the_cut_off(self):
         part = Discharge(**recorded(), meta={"cell": "X"}).loaded_part(2.7)
         np.testing.assert_allclose(part.time_s, [15.0, 20.0, 30.0, 40.0, 47.5])

@@ -29,7 +29,8 @@ from battery_env.estimators.state_files import load_state, save_state
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import ChargeBefore, Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
-_PRIOR_SD_SHARE_Q = 0.25
+#: How far cells of one nominal capacity may lie from it, new and worn: the standard deviation, as a share.
+PRIOR_SD_SHARE_Q = 0.25
 # Of a new 18650; a resistance goes with one over the size.
 _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
@@ -147,7 +148,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         voltage_noise_V = _checked_noise_V(voltage_noise_V, mismatch_V)
         self.current_gain_sd = check_gain_sd(current_gain_sd)
         self.initial_soc = check_initial_soc(initial_soc)
-        q, q_sd = self._prior("q_mobile", prior_q_mobile_C, _PRIOR_SD_SHARE_Q * self.cell.q_mobile)
+        q, q_sd = self._prior("q_mobile", prior_q_mobile_C, PRIOR_SD_SHARE_Q * self.cell.q_mobile)
         r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM * NEW_CELL.q_mobile / self.cell.q_mobile)
         self._means, self._sds = (q, r_o), (q_sd, r_o_sd, float(offset_sd_V))
         soc, sd_soc = self.initial_soc
