@@ -84,7 +84,12 @@ class CostAlgorithm(OffPolicyAlgorithm):
             self.gamma = stated_discount(self.env)
         # One of numpy would make n-step returns double precision, and YAML takes 1e-3 for a text
         for name in ("gamma", "alpha3", "lambda_init", "lambda_min", "lambda_max", "reward_bound"):
-            setattr(self, name, None if getattr(self, name) is None else float(getattr(self, name)))
+            value = getattr(self, name)
+            if value is not None or name not in ("lambda_max", "reward_bound"):
+                try:
+                    setattr(self, name, float(value))
+                except (TypeError, ValueError):
+                    raise ValueError(f"{name}={value!r} must be a number.") from None
         self._check_arguments()
 
         super()._setup_model()

@@ -112,3 +112,6 @@ def test_arguments_are_kept_checked_and_can_be_changed(make_model, tmp_path):
         LAC.load(tmp_path / "model", alpha3=-1)
     # As YAML reads a number without a point
     assert LAC.load(tmp_path / "model", alpha3="1e-1", lambda_max="1e-1").alpha3 == 0.1
+    for wrong in ("lots", None, [1.0]):
+        with pytest.raises(ValueError, match=r"^alpha3=.* must be a number"):
+            LAC.load(tmp_path / "model", alpha3=wrong)
