@@ -140,7 +140,7 @@ def part(cell: str, seed: int) -> Tables:
 
 def _end(quantiles_s: FloatArray, start_s: float, end_s: float) -> dict[str, float]:
     low, middle, high = 100.0 * (quantiles_s - end_s) / (end_s - start_s)
-    return {"error_percent": middle, "width_percent": high - low, "inside": float(low <= 0.0 <= high)}
+    return {"error_percent": middle, "low_percent": low, "high_percent": high, "inside": float(low <= 0.0 <= high)}
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
@@ -149,12 +149,15 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     def over_shares(column: str, how: str) -> Cell:
         return lambda group: side_by_side(group.groupby("share")[column].agg(how).dropna())
 
-    shown = rows.assign(error=rows["error_percent"].abs(), cell=rows["cell"].map(CELLS), inside=100.0 * rows["inside"])
+    width = rows["high_percent"] - rows["low_percent"]
+    shown = rows.assign(
+        error=rows["error_percent"].abs(), width=width, cell=rows["cell"].map(CELLS), inside=100.0 * rows["inside"]
+    )
     cells: dict[str, Cell] = {
         "end at 25 / 50 / 75 %: mean error (%)": over_shares("error", "mean"),
         "worst (%)": over_shares("error", "max"),
         "inside 90 % (%)": over_shares("inside", "mean"),
-        "width of the interval (%)": over_shares("width_percent", "mean"),
+        "width of the interval (%)": over_shares("width", "mean"),
         "whole: settled (%)": lambda group: share_in_percent(whole) if len(whole := group["settled"].dropna()) else "",
     }
     return table_of(shown, ["cell", "knows"], cells)
@@ -166,11 +169,12 @@ def plot(rows: pd.DataFrame) -> Figure:
     figure, panels = new_panels(len(CELLS), 3, (3.4, 3.0))
     for axes, (cell, of_cell) in zip(panels, half.groupby("cell", sort=False), strict=False):
         for colour, (knows, group) in coloured(of_cell.groupby("knows", sort=False)):
-            error, width = group["error_percent"], 0.5 * group["width_percent"]
-            axes.errorbar(group["discharge"], error, width, fmt=".", color=colour, lw=0.8, label=knows)
+            error = group["error_percent"]
+            beside = [error - group["low_percent"], group["high_percent"] - error]
+            axes.errorbar(group["discharge"], error, beside, fmt=".", color=colour, lw=0.8, label=knows)
         axes.axhline(0.0, color="black", lw=0.6)
         axes.set(title=CELLS[str(cell)], xlabel="discharge", ylabel="error of the end, half seen (%)")
-    panels[0].legend(frameon=False, fontsize=7)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     return figure
 
 

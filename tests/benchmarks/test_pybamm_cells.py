@@ -29,7 +29,8 @@ def test_what_is_known_of_a_cell_brings_its_end_nearer(monkeypatch, tmp_path, ca
     ends = rows[rows["share"] < 1.0]
     assert ends["inside"].all() and rows["settled"].dropna().all()
     narrow, wide = (ends[ends["knows"] == each] for each in (LIFE, FIT))
-    assert narrow["width_percent"].max() < 0.5 * wide["width_percent"].max() and narrow["error_percent"].abs().max() < 2.0
+    assert (narrow["high_percent"] - narrow["low_percent"]).max() < 0.5 * (wide["high_percent"] - wide["low_percent"]).max()
+    assert narrow["error_percent"].abs().max() < 2.0
     text = (tmp_path / "pybamm_cells.md").read_text()
     assert "| Enertech, LCO, 2.3 Ah | the fit " in text and text in capsys.readouterr().out
     pybamm_cells.main([*asked, "--redraw"])
