@@ -217,8 +217,8 @@ class OnlineEstimator(Estimator):
 
         :param path: the file
         :raises FileNotFoundError: if there is no such file
-        :raises ValueError: if it is damaged, of another version, of an estimator with other arguments, or holds what no
-            discharge leads to; the estimator is as it was then
+        :raises ValueError: if it is damaged, of another version, or of an estimator with other arguments; the estimator is
+            as it was then
         """
         self._restore(load_state(path, self._made_with()))
 
