@@ -29,7 +29,7 @@ def save_state(path: str | os.PathLike[str], settings: Mapping[str, Any], arrays
             warnings.warn(f"{error}. It is kept as {set_aside(target).name}, and a new one takes its place.", stacklevel=3)
         except ValueError as error:
             raise FileExistsError(f"{target} exists, and is no state of an estimator: choose another name") from error
-    metadata = json.dumps({"kind": _KIND, "format": FORMAT_VERSION, "settings": settings, "sha256": _digest(arrays)})
+    metadata = json.dumps({"kind": _KIND, "format": FORMAT_VERSION, "settings": settings, "sha256": _digest(arrays, settings)})
     with replacing(target) as part:
         np.savez(part, metadata=np.array(metadata), **arrays)  # type: ignore[arg-type]  # none is named allow_pickle
     return target
@@ -42,7 +42,11 @@ def load_state(path: str | os.PathLike[str], settings: Mapping[str, Any]) -> dic
         raise ValueError(
             f"{path} has format {metadata['format']}, this version reads {FORMAT_VERSION}: begin a discharge anew"
         )
-    saved, own = metadata["settings"], json.loads(json.dumps(settings))
+    saved: Any = metadata.get("settings")
+    own = json.loads(json.dumps(settings))
+    # compiled code takes the arrays as they are
+    if metadata.get("sha256") != _digest(arrays, saved):
+        raise ValueError(f"{path} is damaged: it is not what was saved")
     different = sorted(name for name in saved.keys() | own.keys() if saved.get(name) != own.get(name))
     if different:
         name = different[0]
@@ -50,15 +54,12 @@ def load_state(path: str | os.PathLike[str], settings: Mapping[str, Any]) -> dic
             f"{path} is of an estimator with {name} = {saved.get(name)!r}, this one has {own.get(name)!r}: make one with the "
             f"same arguments (different: {', '.join(different)})"
         )
-    # compiled code takes them as they are
-    if metadata["sha256"] != _digest(arrays):
-        raise ValueError(f"{path} is damaged: its arrays are not those that were saved")
     return arrays
 
 
-def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """Of the names, types, shapes and contents of arrays; between the fields of records lies what nobody wrote."""
-    digest, parts = sha256(), sorted(arrays.items())
+def _digest(arrays: Mapping[str, NDArray[Any]], settings: Any) -> str:
+    """Of settings, and names, types, shapes and contents of arrays; between the fields of records lies what nobody wrote."""
+    digest, parts = sha256(json.dumps(settings, sort_keys=True).encode()), sorted(arrays.items())
     while parts:
         name, array = parts.pop()
         if array.dtype.names:
