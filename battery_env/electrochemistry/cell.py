@@ -293,6 +293,10 @@ def check_dt(dt: float, cell: CellParameters) -> float:
     return float(dt)
 
 
-def is_other_size(q_mobile_C: float) -> bool:
-    """Whether a cell is so much smaller or larger than a new 18650 that this one's surfaces are none of its own."""
-    return not 1.0 / _OTHER_SIZE < q_mobile_C / NEW_CELL.q_mobile < _OTHER_SIZE
+def new_cell_of(q_mobile_C: float) -> CellParameters:
+    """A new cell that holds so much: an 18650 within a factor of two, else one whose surfaces and mass go with its charge."""
+    size = q_mobile_C / NEW_CELL.q_mobile
+    if 1.0 / _OTHER_SIZE < size < _OTHER_SIZE:
+        return NEW_CELL
+    surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
+    return NEW_CELL.replace(q_mobile=q_mobile_C, r_o=NEW_CELL.r_o / size, **surfaces)

@@ -12,8 +12,8 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K, check_positive
-from battery_env.electrochemistry import NEW_CELL, CellParameters, check_cell, check_dt
-from battery_env.electrochemistry.cell import UNDELIVERED, is_other_size
+from battery_env.electrochemistry import CellParameters, check_cell, check_dt
+from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
 from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
@@ -178,12 +178,7 @@ def _prior(records: Sequence[Record], start: CellParameters | None, thermal: boo
     """Return what is thought of the constants before the data, but for what is measured."""
     check_cell(start, thermal)
     q_mobile = float(Q_MOBILE.check(UNDELIVERED * max(drawn_charge_C(record) for record in records)))
-    if start is None:
-        size = q_mobile / NEW_CELL.q_mobile
-        start = NEW_CELL
-        if is_other_size(q_mobile):
-            surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
-            start = NEW_CELL.replace(q_mobile=q_mobile, r_o=NEW_CELL.r_o / size, **surfaces)
+    start = new_cell_of(q_mobile) if start is None else start
     known = [getattr(record, "temperature_C", None) for record in records]
     temperatures_C = [column[0] for column in known if column is not None]
     measured = {"Tb0": ZERO_CELSIUS_K + float(np.mean(temperatures_C))} if temperatures_C else {}

@@ -138,8 +138,9 @@ _GOES_ON = Ahead()
 
 def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON) -> Calibration:
     """What one discharge says, and of one in progress what comes after it."""
-    seen = _look_at(discharge, settings)
-    known = settings.in_progress() if seen.in_progress else settings
+    is_whole = not np.isnan(discharge.eod_time_s(settings.cut_off_V))
+    known = settings if is_whole else settings.with_nominal_prior()
+    seen = _look_at(discharge, known)
     estimate, method, model, now = _estimate(seen, known, ahead.load)
     # a cell in progress has not ended, however low its model comes in the pulses before
     limits = (-np.inf, 0.0) if seen.in_progress else (settings.cut_off_V, seen.future.mean_A)

@@ -12,13 +12,13 @@ import numpy as np
 from battery_env.checks import check_not_negative, check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
-from battery_env.electrochemistry.cell import UNDELIVERED, is_other_size
+from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
 from battery_env.estimators.diagnosis.conditions import Condition
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.kalman.filter import PRIOR_SD_SHARE_Q, ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.parameters import PARAMETER_NAMES, check_parameters
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.policies.pretrained import policy_of_file
 from battery_env.records import CUT_OFF_V
@@ -153,15 +153,15 @@ class Settings:
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
 
-    def in_progress(self) -> Settings:
-        """These settings for a discharge in progress: a nominal capacity tells about how much a cell of another size holds."""
+    def with_nominal_prior(self) -> Settings:
+        """What a nominal capacity tells of a cell of another size than a new 18650, of which nothing else is known."""
         is_known = self.prior_q_mobile_C is not None or self.cell is not None or "q_mobile" not in self.parameters
         if self.nominal_Ah is None or is_known or self.method == "policy":
             return self
-        q_mobile_C = UNDELIVERED * 3600.0 * self.nominal_Ah
-        return (
-            replace(self, prior_q_mobile_C=(q_mobile_C, PRIOR_SD_SHARE_Q * q_mobile_C)) if is_other_size(q_mobile_C) else self
-        )
+        q_mobile_C = float(np.clip(UNDELIVERED * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
+        if (cell := new_cell_of(q_mobile_C)) is NEW_CELL:
+            return self
+        return replace(self, cell=cell, prior_q_mobile_C=(q_mobile_C, PRIOR_SD_SHARE_Q * q_mobile_C))
 
     def other_load(self, current_A: float) -> str:
         """Why the constants may not hold for a mean current; empty if they do."""

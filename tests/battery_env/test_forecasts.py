@@ -15,6 +15,7 @@ from battery_env.electrochemistry import NEW_CELL
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.estimates import last_estimate
 from battery_env.estimators import ExtendedKalmanFilter
+from battery_env.lab.calibrate import calibrate as calibrate_record
 from battery_env.lab.forecast import WHOLE_ERROR
 from battery_env.lab.running import forecast_end, read_load
 from battery_env.lab.settings import Settings
@@ -371,14 +372,16 @@ class TestCommand:
         assert main(["forecast", "run_2.5A.csv", "--out", "out"]) == 2
         assert "run_2.5A_forecast.json, out/run_2.5A_forecast.png would be replaced" in capsys.readouterr().err
 
-    @pytest.mark.parametrize("size", [0.3, 2.5, 10.0])
+    @pytest.mark.parametrize("size", [0.05, 0.3, 2.5, 10.0, 100.0])
     @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
     def test_a_nominal_capacity_tells_what_a_cell_of_another_size_holds(self, size, share):
-        cell = with_equilibrium(NEW_CELL.replace(kn=800.0), [0.02, -0.05, 0.05])
+        cell = with_equilibrium(NEW_CELL.replace(kn=800.0), [-0.03, 0.02, 0.05])
         made = simulate(2.0 * size, 6800.0 * size, 0.1 / size, load_unit="current", cell=cell, cut_off_V=2.7)
         record = Discharge(made.time_s[::10], made.voltage_V[::10], made.current_A[::10])
         seen, end_s = record.until(share * made.time_s[-1]), made.time_s[-1]
-        low_s, median_s, high_s = forecast_end(seen, Settings(nominal_Ah=2.0 * size)).eod_quantile_s()
+        settings = Settings(nominal_Ah=2.0 * size)
+        low_s, median_s, high_s = forecast_end(seen, settings).eod_quantile_s()
+        assert "rests on its prior" in calibrate_record(seen, settings).reason
         assert low_s < end_s < high_s and abs(median_s / end_s - 1.0) < 0.25
         assert not low_s < end_s < (forecast_end(seen).eod_quantile_s(0.95) if size > 1.0 else 0.0)
 

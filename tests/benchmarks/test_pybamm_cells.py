@@ -21,6 +21,7 @@ def life(name, seed):
 def test_what_is_known_of_a_cell_brings_its_end_nearer(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(pybamm_cells, "simulated", life)
     monkeypatch.setattr(pybamm_cells, "DISCHARGES", 12)
+    monkeypatch.setattr(pybamm_cells, "FITTED", (0, 7, 10))
     asked = ["--cells", "Ai2020", "--seeds", "1", "--jobs", "1", "--out", str(tmp_path)]
     pybamm_cells.main(asked)
     rows = pd.read_csv(tmp_path / "pybamm_cells.csv")
