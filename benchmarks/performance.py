@@ -1,11 +1,12 @@
 """
 Where the time of LAC goes: updates beside those of Stable-Baselines3's SAC, beside what their arithmetic takes, and compiled
-beside not; ``learn()`` with many cells at once, growth with cells, batches and widths.
+beside not; ``learn()`` with many cells at once, growth with cells, batches and widths; and what a GPU is worth.
 
 .. code-block:: bash
 
   python -m benchmarks.performance
   python -m benchmarks.performance --only updates learn
+  python -m benchmarks.performance --only gpu --updates 20
 
 Contestants take turns, as in ``benchmarks.throughput``, and ratios are taken within each round. What runs on one thread is
 measured by the time of the processor, which other processes do not count in.
@@ -37,13 +38,16 @@ from benchmarks.throughput import race, spread
 from sb3_lac import LAC, GymnasiumVecEnv, PublishedLAC
 from sb3_lac.costs import CostAlgorithm
 
-SECTIONS = ("updates", "compiled", "learn", "growth")
+SECTIONS = ("updates", "compiled", "learn", "growth", "gpu")
 
 _ENV_ID = "BatteryQmax-v0"
 _TRANSITIONS = 1_024
 _WARM_UP_UPDATES = 10
 _LARGE = [256, 256, 256]
 _SMALL = [64, 64]
+_GPU = "cuda" if th.cuda.is_available() else ""
+# networks and batch sizes of the comparison of a GPU with one core, and for which part of its updates the core has time
+_ON_GPU = (([64, 64], 256, 1), ([256, 256, 256], 256, 4), ([1024, 1024, 1024], 4096, 200))
 _CELLS = (1, 4, 16, 64, 256)
 _BATCH_SIZES = (64, 256, 1024)
 _WIDTHS = (32, 64, 128, 256, 512)
@@ -64,6 +68,7 @@ def ready_model(
     env: VecEnv,
     batch_size: int = 256,
     policy_kwargs: dict[str, Any] | None = None,
+    device: str = "cpu",
     **kwargs: Any,
 ) -> CostAlgorithm | SAC:
     """A model that has transitions in its replay buffer and has made its first updates."""
@@ -74,7 +79,7 @@ def ready_model(
         buffer_size=100 * _TRANSITIONS,
         batch_size=batch_size,
         policy_kwargs={"net_arch": net_arch, "activation_fn": nn.LeakyReLU, **(policy_kwargs or {})},
-        device="cpu",
+        device=device,
         seed=0,
         **kwargs,
     )
@@ -252,6 +257,60 @@ def measure_growth(rounds: int, updates: int) -> pd.DataFrame:
     return table.assign(over=names[0], value=names[1].astype(int))[["over", "value", "speed"]]
 
 
+def measure_gpu(rounds: int, updates: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """
+    Updates a second of LAC on a GPU, compiled and not, beside those of SAC there and of LAC on one core; and ``learn()`` with
+    64 cells and one update per step of all of them.
+    """
+
+    def with_tf32(model: OffPolicyAlgorithm) -> int:
+        th.set_float32_matmul_precision("high")
+        try:
+            return updates_of(model, updates)
+        finally:
+            th.set_float32_matmul_precision("highest")
+
+    th.set_num_threads(1)
+    contestants: dict[str, Callable[[], int]] = {}
+    for net_arch, batch_size, slower in _ON_GPU:
+        ready = partial(ready_model, net_arch=net_arch, env=many_cells(64), batch_size=batch_size)
+        sac, eager, core = ready(SAC, device=_GPU), ready(LAC, device=_GPU), ready(LAC)
+        compiled = ready(LAC, device=_GPU, compile_update=True)
+        with_tf32(compiled)  # compiles it once more
+        less = max(1, updates // slower)
+        turns = {
+            "SAC": partial(updates_of, sac, updates),
+            "eager": partial(updates_of, eager, updates),
+            "compiled": partial(updates_of, compiled, updates),
+            "TF32": partial(with_tf32, compiled),
+            "core": partial(updates_of, core, less),
+            "learn": partial(steps_of, compiled, updates),
+            "learn, core": partial(steps_of, core, less),
+        }
+        contestants |= {f"{name}, {'-'.join(map(str, net_arch))}, {batch_size}": turn for name, turn in turns.items()}
+    speeds = race(contestants, rounds, time.perf_counter)
+    rows = []
+    for net_arch, batch_size, _ in _ON_GPU:
+        layers = "-".join(map(str, net_arch))
+        of = {name: speeds[f"{name}, {layers}, {batch_size}"] for name in turns}
+        rows.append(
+            {
+                "networks": layers,
+                "batch": batch_size,
+                "LAC, updates a second": spread(of["eager"], 0),
+                "than SAC, times": spread(of["eager"] / of["SAC"], 2),
+                "compiled": spread(of["compiled"], 0),
+                "than not compiled, times": spread(of["compiled"] / of["eager"], 2),
+                "with TF32, than without": spread(of["TF32"] / of["compiled"], 2),
+                "one core": spread(of["core"], 1),
+                "not compiled, than one core, times": spread(of["eager"] / of["core"], 2),
+                "compiled, than one core": spread(of["compiled"] / of["core"], 1),
+                "learn(), than on one core": spread(of["learn"] / of["learn, core"], 1),
+            }
+        )
+    return speeds, pd.DataFrame(rows).assign(GPU=th.cuda.get_device_name())
+
+
 def plot_growth(table: pd.DataFrame) -> Figure:
     """Draw LAC's speed over cells, batch size and width."""
     figure = new_figure(10.0, 3.2)
@@ -278,13 +337,17 @@ def plot_growth(table: pd.DataFrame) -> Figure:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("performance", __doc__, jobs=None)
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="what to measure, all by default")
+    parser.add_argument(
+        "--only", nargs="+", choices=SECTIONS, default=list(SECTIONS if _GPU else SECTIONS[:-1]), help="all by default"
+    )
     parser.add_argument("--rounds", type=positive, default=20, help="turns of each contestant")
     parser.add_argument("--updates", type=positive, default=6, help="updates of a turn, and steps of all cells")
     parser.add_argument("--cells", type=positive, default=64, help="cells of learn()")
     parser.add_argument("--threads", type=positive, nargs="+", default=[1, 2], help="threads of torch")
     study = Study(parser, arguments)
     chosen = study.chosen
+    if "gpu" in chosen.only and not _GPU:
+        parser.error("gpu needs an NVIDIA GPU that torch can use: torch.cuda.is_available() is False")
 
     if "updates" in chosen.only:
         speeds, table = measure_updates(chosen.rounds, chosen.updates, chosen.threads)
@@ -299,6 +362,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         growth = measure_growth(max(1, chosen.rounds // 2), chosen.updates)
         medians = growth.groupby(["over", "value"], sort=False)["speed"].apply(spread, digits=0).reset_index()
         study.write({"growth": growth}, {"growth": plot_growth(growth)}, markdown(medians), "growth")
+    if "gpu" in chosen.only:
+        speeds, table = measure_gpu(chosen.rounds, chosen.updates)
+        study.write({"gpu": speeds}, {}, markdown(table), "gpu")
 
 
 if __name__ == "__main__":

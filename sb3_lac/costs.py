@@ -306,7 +306,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         # The buffer, or the discount, may have been set by hand
         self._adopt_replay_buffer()
 
-        # Kept on the device until the end: reading one value would wait for all pending work
+        # Kept on the device until the end: each value that is read waits for all pending work, as one look at the samples does
         names: tuple[str, ...] = ()
         metrics_per_step: list[th.Tensor] = []
 
@@ -315,8 +315,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
             for gradient_step in range(gradient_steps):
                 # Sample replay buffer
                 replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-                if self.device.type == "cpu":  # a look at those on another device would wait for all pending work
-                    refuse_samples(replay_data, self.num_timesteps)
+                refuse_samples(replay_data, self.num_timesteps)
                 update_targets = (self._n_updates + gradient_step) % self.target_update_interval == 0
                 names, metrics = update(replay_data, self.costs(replay_data), update_targets)
                 metrics_per_step.append(metrics)

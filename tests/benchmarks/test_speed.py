@@ -20,7 +20,13 @@ def small(monkeypatch):
     for name in ("_SIMULATED_STEPS", "_SIMULATIONS", "_BATCHED_STEPS", "_ENV_STEPS"):
         monkeypatch.setattr(throughput, name, 3)
     monkeypatch.setattr(throughput, "_ENVIRONMENTS", {"BatteryRo-v0": 3})
-    for name, value in {"_TRANSITIONS": 32, "_LARGE": [16, 16], "_SMALL": [8], "_COPIED_NUMBERS": 64}.items():
+    for name, value in {
+        "_TRANSITIONS": 32,
+        "_LARGE": [16, 16],
+        "_SMALL": [8],
+        "_COPIED_NUMBERS": 64,
+        "_ON_GPU": (([8], 8, 1),),
+    }.items():
         monkeypatch.setattr(performance, name, value)
     for name, values in {"_CELLS": (1, 2), "_BATCH_SIZES": (8, 16), "_WIDTHS": (4, 8)}.items():
         monkeypatch.setattr(performance, name, values)
@@ -127,7 +133,10 @@ def test_bytes_are_those_of_adam_and_of_the_target():
     assert performance.moved_bytes(model) == 28 * actor + 40 * critic
 
 
-def test_sections_of_performance_are_written(tmp_path, capsys):
+def test_sections_of_performance_are_written(tmp_path, capsys, monkeypatch):
+    # where no GPU is, the processor stands for it
+    monkeypatch.setattr(performance, "_GPU", "cpu")
+    monkeypatch.setattr(th.cuda, "get_device_name", lambda: "a card")
     short = ["--rounds", "2", "--updates", "1", "--cells", "2", "--threads", "1"]
     performance.main([*short, "--out", str(tmp_path)])
     assert {path.stem for path in tmp_path.iterdir()} == set(performance.SECTIONS)

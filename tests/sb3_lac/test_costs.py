@@ -170,9 +170,12 @@ def test_what_is_not_finite_is_refused_before_it_is_stored(make_model, make_env,
     assert np.isfinite(model.replay_buffer.rewards).all()
 
 
+@pytest.mark.parametrize(
+    "device", ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU"))]
+)
 @pytest.mark.parametrize("where", ["observations", "next_observations", "actions", "rewards"])
-def test_what_was_put_into_the_buffer_elsewhere_reaches_no_weights(make_model, make_env, where):
-    model = make_model(make_env())
+def test_what_was_put_into_the_buffer_elsewhere_reaches_no_weights(make_model, make_env, where, device):
+    model = make_model(make_env(), device=device)
     getattr(model.replay_buffer, where)[:] = float("nan")
     weights = [parameter.detach().clone() for parameter in model.policy.parameters()]
     with pytest.raises(ValueError, match=rf"The replay buffer gave {where} with nan at step \d+: all must be finite"):

@@ -115,7 +115,7 @@ def test_policy_keeps_all_arguments_when_saved_and_loaded(make_model, tmp_path):
     policy_kwargs = {"net_arch": {"pi": [8], "qf": [12]}, "n_critics": 3, "share_features_extractor": True}
     policy = make_model(n_collect=0, use_sde=True, policy_kwargs=policy_kwargs).policy
     policy.save(tmp_path / "policy.pkl")
-    loaded = LyapunovPolicy.load(tmp_path / "policy.pkl")
+    loaded = LyapunovPolicy.load(tmp_path / "policy.pkl", device="cpu")
     assert (policy.actor_kwargs, policy.critic_kwargs) == (loaded.actor_kwargs, loaded.critic_kwargs)
     assert loaded.actor.features_extractor is loaded.critic.features_extractor
     for name, tensor in policy.state_dict().items():
