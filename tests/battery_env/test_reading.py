@@ -756,3 +756,20 @@ def test_the_first_rows_of_a_step_under_a_clock_of_each_step_may_be_missing(miss
     table.loc[table["step"] == 8, "time"] += 300.0
     with pytest.raises(ValueError, match="time_s must increase"):
         read_discharges(table)
+
+
+@pytest.mark.parametrize("rest_rows", [0, 20_000])
+def test_a_clock_that_is_put_back_under_load_is_no_few_rows(rest_rows):
+    """However many other rows there are, what was drawn in that time would be lost."""
+    rest = pd.DataFrame({"time": np.arange(-rest_rows, 0.0), "current": 0.0})
+    rest["voltage"] = RECORD.voltage_V[0] - 1e-6 * rest["time"]
+    for back_s, advice in ((300.0, "time_s must increase"), (3600.0, "put back by an hour in autumn")):
+        later = np.where(RECORD.time_s > 1500.0, back_s, 0.0)
+        table = pd.concat([rest, TABLE.assign(time=RECORD.time_s - later)], ignore_index=True)
+        with pytest.raises(ValueError, match=advice):
+            read(table)
+    # but at rest nothing is
+    table = pd.concat([rest, TABLE.assign(time=RECORD.time_s + 400.0)], ignore_index=True)
+    table.loc[: rest_rows // 2, "time"] += 100.0
+    if rest_rows:
+        near(read(table, "left out with a time before"))

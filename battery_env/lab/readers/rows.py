@@ -473,8 +473,8 @@ def _passed_C(rows: pd.DataFrame) -> float:
 
 def without_rows_out_of_time(rows: pd.DataFrame) -> pd.DataFrame:
     """
-    Without rows that are not later than all before them, if they are few, or say what the others say. A clock may start anew
-    with a cycle.
+    Without rows that are not later than all before them, if they are few, or say what the others say, and if little charge
+    passes from each to the next, as all of that is lost where a clock was put back. A clock may start anew with a cycle.
     """
     time = rows["time"]
     if (np.diff(time) > 0.0).all():
@@ -483,7 +483,9 @@ def without_rows_out_of_time(rows: pd.DataFrame) -> pd.DataFrame:
     latest = time.groupby(cycle).cummax().groupby(cycle).shift()
     twice, back = (time == latest).to_numpy(), (time < latest).to_numpy()
     kept, few = rows[~(twice | back)], max(1.0, _FEW_SHARE * len(rows))
-    if back.sum() > max(few, _changes(rows, "step").sum()):
+    on_end = back & np.roll(back, 1)  # no row is behind itself, so that the first one is none
+    lost_C = (time.diff().clip(lower=0.0) * rows["current"].abs())[on_end].sum()
+    if back.sum() > max(few, _changes(rows, "step").sum()) or lost_C > _FEW_SHARE * _passed_C(rows):
         _refuse_backwards(rows)
         return rows
     steps = rows[["time", "voltage", "current"]].diff().abs()
@@ -503,7 +505,8 @@ def _refuse_backwards(rows: pd.DataFrame) -> None:
     time_s = rows["time"].to_numpy()
     step_s = np.diff(time_s, prepend=time_s[:1])
     on_end = (step_s < 0.0) & (np.append(step_s[1:], 0.0) < 0.0)
-    hour = np.abs(step_s + 3600.0) <= np.abs(np.median(step_s)) + _STEP_S
+    interval_s = (1.0 + SWITCH_SHARE) * np.maximum(np.abs(np.median(step_s)), np.abs(np.roll(step_s, 1)))
+    hour = np.abs(step_s + 3600.0) <= interval_s
     advice_of_hour = "Clocks are put back by an hour in autumn: give times of UTC"
     for which, advice in ((on_end, "Sort the rows by time"), (hour, advice_of_hour)):
         if which.any():
