@@ -773,3 +773,32 @@ def test_a_clock_that_is_put_back_under_load_is_no_few_rows(rest_rows):
     table.loc[: rest_rows // 2, "time"] += 100.0
     if rest_rows:
         near(read(table, "left out with a time before"))
+
+
+def test_one_cell_without_a_discharge_does_not_lose_the_others():
+    """As an empty slot of a tester, or a cell that is charged only."""
+    for other in (CHARGE, TABLE.assign(current=0.0, voltage=0.001)):
+        table = pd.concat([other.assign(Channel=1), TABLE.assign(Channel=2)], ignore_index=True)
+        same(read(table, "cell 1: "))
+    # rows above the first name are of the cell below
+    same(read(TABLE.assign(Barcode=["", *["A7"] * (len(TABLE) - 1)])))
+
+
+@pytest.mark.parametrize("unit", ["hh:mm:ss.sss", "HH:mm:ss.fff", "[h]:mm:ss", "h:min:s.ms", "hh:mm:ss.0", "H:M:S"])
+def test_a_unit_of_hours_minutes_and_seconds_is_a_clock(unit):
+    clock = [str(pd.Timedelta(seconds=t))[7:] for t in RECORD.time_s.tolist()]
+    same(read(TABLE.assign(time=clock).rename(columns={"time": f"Total Time({unit})"})))
+
+
+def test_what_no_row_holds_is_no_matter_of_the_last_line():
+    with pytest.warns(UserWarning) as said, pytest.raises(ValueError, match=r"must hold numbers, got '0\.0 s' in row 1"):
+        warnings.warn("one at least", stacklevel=1)
+        read_discharges(TABLE.assign(time=[f"{t} s" for t in TABLE["time"]]))
+    assert len(said) == 1
+
+
+def test_a_current_that_a_meter_could_not_read_is_refused_as_such():
+    table = TABLE.assign(Capacity=1.0).rename(columns={"Capacity": "Capacity (Ah)"})
+    table.loc[[5, 100], "current"] = 9.9e37
+    with pytest.raises(ValueError, match=r"current_A must lie within|cannot be told"):
+        read_discharges(table)

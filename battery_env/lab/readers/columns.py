@@ -67,8 +67,6 @@ _TIMES = _units(
         "min mins minute minutes minuten": 60.0,
         "h hr hrs hour hours std stunden": 3600.0,
         "d day days tage": 86400.0,
-        # text such as 1:02:03.5, which becomes seconds when it is read
-        "h:min:s.ms h:m:s.ms hh:mm:ss hh:mm:ss.ms h:m:s h:min:s": 1.0,
     }
 )
 _VOLTS = _units({"v volt volts": 1.0, "mv mvolt mvolts millivolt millivolts": 1e-3})
@@ -98,10 +96,12 @@ _IN_BRACKETS = re.compile(
 _GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~{}/]|[,:](?=.)|(?<=[_\s])(?:in|IN)(?=[_\s]))+")
 # The sign of a degree, and what is left of it after another encoding.
 _DEGREE_SIGN = re.compile("^[Ââ]?[°º˚\ufffd?]")
+# A unit of text such as 1:02:03.5, which becomes seconds when it is read.
+_CLOCK = re.compile(r"\[?h+\]?:m+(?:in)?:s+(?:[.,]?(?:m?s+|f+|0+|x+|z+))?$")
 # So long are names that are a unit, as mV; a shorter one may be anything, as min.
 _LEAST_UNIT_NAME = {"time": 4, "voltage": 2, "current": 2, "capacity": 5}
 # What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
-_DISCHARGE = re.compile(r"\bd\b|\bdis\b|dch|disch|d[ée]charg|descarg|scaric|entlad|放电")
+_DISCHARGE = re.compile(r"\bd\b|\bdis\b|dch|dsg|disch|d[ée]charg|descarg|scaric|entlad|放电")
 _CHARGE = re.compile(r"\bc\b|ch|carg|caric|lad|充电")
 _NUMBER = re.compile(r"[-+.]*\d[-+.,:/\deE\sT]*$|nan$|true$|false$", flags=re.IGNORECASE)
 _FEW_WORDS, _AROUND_UNITS = 20, "[]()- "
@@ -254,6 +254,7 @@ def _unit(text: str, quantity: str) -> str | None:
     first, *_ = [*text.split(), ""]
     for unit in ("".join(text.split()), first):
         unit = _DEGREE_SIGN.sub("", unit) if quantity in ("temperature", "ambient") else unit
+        unit = "s" if quantity in ("time", "step_time") and _CLOCK.match(unit) else unit
         if unit in _UNITS.get(quantity, {}):
             return unit
     return None

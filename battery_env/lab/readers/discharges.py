@@ -18,7 +18,7 @@ import pandas as pd
 
 from battery_env.arrays import FloatArray
 from battery_env.lab.readers.columns import Column, FileFormat, unit_of
-from battery_env.lab.readers.rows import cells_of
+from battery_env.lab.readers.rows import cells_of, mended
 from battery_env.lab.readers.tables import columns_of, read_columns
 from battery_env.records import LEAST_LOAD_SHARE, SWITCH_SHARE, ChargeBefore, Shown, drawn
 from battery_env.records.discharge import LEAST_SAMPLES, Discharge, read_nasa_mat
@@ -193,11 +193,18 @@ def _name_of(source: str | Path | pd.DataFrame) -> str:
 def _recordings(source: str, table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> list[Recording]:
     stated = frozenset(quantity for quantity, column in columns.items() if column.unit or quantity == "step")
     stated |= {"sign"} if file_format.discharge_is_negative is None else set()
-    return [
-        recording
-        for cell, rows in cells_of(table, columns, file_format).items()
-        for recording in _split(rows, {"source": source} | ({"cell": cell} if cell else {}), stated)
-    ]
+    found, reasons = [], []
+    for cell, rows in cells_of(table, columns).items():
+        meta = {"source": source} | ({"cell": cell} if cell else {})
+        try:
+            found += _split(mended(rows, columns, file_format), meta, stated)
+        except ValueError as error:
+            reasons.append(f"cell {cell}: {error}" if cell else str(error))
+    if not found:
+        raise ValueError(reasons[0])
+    for reason in reasons:
+        warnings.warn(f"{reason}. It is left out", stacklevel=2)
+    return found
 
 
 def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> list[Recording]:
@@ -345,6 +352,8 @@ def _with_count(shown: Shown, rows: pd.DataFrame) -> Shown:
     """With how much the charge under load is another one than the tester counted row by row, or than a clock lost."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
+    if not len(loaded):  # of values that no cell has, which are refused later
+        return shown
     part = slice(loaded[0], loaded[-1] + 1)
     if "lost" in rows:  # all of it in each step of the program, none, or any part in all alike
         shown = shown._replace(uncounted_C=float(rows["lost"].to_numpy()[part][1:] @ np.abs(current_A[part][:-1])) / 3.0**0.5)

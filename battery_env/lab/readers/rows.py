@@ -47,23 +47,24 @@ _TEMPERATURES_C = (-60.0, 150.0)
 _THOUSANDS = re.compile(r"^\s*[-+]?\d{1,3}(?:[,.' ]\d{3})+(?:[.,]\d+)?\s*$")
 
 
-def cells_of(table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> dict[str, pd.DataFrame]:
+def cells_of(table: pd.DataFrame, columns: Mapping[str, Column]) -> dict[str, pd.DataFrame]:
     """
-    The rows of each cell in SI units, of a table with columns by quantity as they were written, whose index counts the rows
-    below the header; the name is empty where the table holds one cell.
+    The rows of each cell, of a table with columns by quantity as they were written, whose index counts the rows below the
+    header; the name is empty where the table holds one cell.
     """
     for mend in (without_blank_rows, without_headers, without_cut_line):
         table = mend(table, columns)
     if len(table) < LEAST_SAMPLES:
         raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows below the header, got {len(table)}")
     named = table["cell"].astype("string") if "cell" in table else pd.Series("", index=table.index)
-    cells = named.ffill().fillna("").astype(str)
+    cells = named.ffill().bfill().fillna("").astype(str)
     if cells.nunique() == 1 or cells.value_counts().min() < LEAST_SAMPLES:
-        return {"": _mended(table, columns, file_format)}
-    return {name: _mended(table[cells == name], columns, file_format) for name in cells.unique()}
+        return {"": table}
+    return {name: table[cells == name] for name in cells.unique()}
 
 
-def _mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> pd.DataFrame:
+def mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> pd.DataFrame:
+    """The rows of a cell in SI units, and in order."""
     rows = in_si_units(table, columns)
     for mend in (
         without_dead_ends,
@@ -104,10 +105,11 @@ def without_headers(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.Da
 
 def without_cut_line(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
     """Without the last line where it is incomplete, as in a file that is being written."""
-    last = table.tail(1)
+    last = table.tail(2)
     values = [last[each] if "time" in each else pd.to_numeric(last[each], errors="coerce") for each in _measured(table)]
-    if any(each.isna().any() for each in values):
-        _say(f"the last line, row {last.index[0] + 1}, is incomplete, and left out")
+    # what the row before does not hold either is no matter of the end
+    if any(each.isna().iloc[-1] and each.notna().iloc[0] for each in values):
+        _say(f"the last line, row {last.index[-1] + 1}, is incomplete, and left out")
         return table.iloc[:-1]
     return table
 
@@ -505,8 +507,8 @@ def _refuse_backwards(rows: pd.DataFrame) -> None:
     time_s = rows["time"].to_numpy()
     step_s = np.diff(time_s, prepend=time_s[:1])
     on_end = (step_s < 0.0) & (np.append(step_s[1:], 0.0) < 0.0)
-    interval_s = (1.0 + SWITCH_SHARE) * np.maximum(np.abs(np.median(step_s)), np.abs(np.roll(step_s, 1)))
-    hour = np.abs(step_s + 3600.0) <= interval_s
+    interval_s = (1.0 + SWITCH_SHARE) * np.maximum(np.abs(np.median(step_s)), np.roll(step_s, 1))
+    hour = (step_s < 0.0) & (np.abs(step_s + 3600.0) <= interval_s)
     advice_of_hour = "Clocks are put back by an hour in autumn: give times of UTC"
     for which, advice in ((on_end, "Sort the rows by time"), (hour, advice_of_hour)):
         if which.any():
