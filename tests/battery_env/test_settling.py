@@ -435,3 +435,13 @@ class TestForecasts:
         found = expected_current(SECONDS[:3000], current_A)
         assert found.mean_A == pytest.approx(mean_A, abs=0.02)
         assert sd_limits_A[0] <= found.sd_A <= sd_limits_A[1]
+
+
+def test_a_load_that_grows_in_steps_while_the_voltage_comes_back_from_a_larger_one_is_followed(calibrator):
+    """The voltage before the first step was low yet, and that before the next one counts."""
+    load = np.concatenate([np.zeros(30), np.tile(np.repeat([2.0, 0.0, 0.3, 1.0], [300, 3, 19, 60]), 40)])
+    record = simulate(load, 6500.0, 0.12, load_unit="current", thermal=True, cut_off_V=2.7)
+    # a row has the current until then
+    pulses = Discharge(record.time_s[1:], record.voltage_V[1:], record.current_A[:-1]).loaded_part(2.7)
+    found = calibrator().estimate(pulses)
+    assert "follow" not in found.reason and found.q_mobile == pytest.approx(6500.0, rel=0.01)

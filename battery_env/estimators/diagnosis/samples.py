@@ -405,7 +405,7 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
     if abs(switched_A) > min(SWITCH_SHARE * last.largest_A, _LEAST_JUMP_A):
         last.jump_s = time_s
     if abs(switched_A) > SWITCH_SHARE * last.largest_A:
-        if switched_A * switch.size_A < 0.0 and _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
+        if _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):  # or nothing was left to follow
             switch.size_A = 0.0
         if switch.size_A == 0.0:
             switch.charge_C, switch.before_ohm = 0.0, r_o
