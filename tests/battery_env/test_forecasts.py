@@ -383,7 +383,20 @@ class TestCommand:
         low_s, median_s, high_s = forecast_end(seen, settings).eod_quantile_s()
         assert "rests on its prior" in calibrate_record(seen, settings).reason
         assert low_s < end_s < high_s and abs(median_s / end_s - 1.0) < 0.25
-        assert not low_s < end_s < (forecast_end(seen).eod_quantile_s(0.95) if size > 1.0 else 0.0)
+        low_s, _, high_s = forecast_end(seen).eod_quantile_s()
+        assert size < 1.0 or share > 0.5 or not low_s < end_s < high_s
+
+    @pytest.mark.parametrize("size", [1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0])
+    @pytest.mark.parametrize("rate", [0.3, 1.0])
+    def test_of_a_larger_cell_that_is_not_stated_the_filter_is_not_sure(self, size, rate):
+        surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
+        cell = NEW_CELL.replace(q_mobile=6800.0 * size, r_o=0.15 / size, **surfaces)
+        made = simulate(2.0 * rate * size, load_unit="current", cell=cell, thermal=True)
+        record = Discharge(made.time_s[::10], made.voltage_V[::10], made.current_A[::10])
+        for share in (0.1, 0.25, 0.5, 0.75):
+            found = calibrate_record(record.until(share * made.time_s[-1]))
+            # hundreds of standard deviations, were a prior around a new 18650 all that there is
+            assert abs(found.predicted_eod_time_s - made.time_s[-1]) < 4.0 * found.sd_predicted_eod_time_s, share
 
     def test_a_life_tells_more_of_its_own_load_than_of_any_other(self):
         life, running = track_life(self.discharges[:10], 2.7), self.discharges[10].until(1200.0)

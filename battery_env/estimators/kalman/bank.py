@@ -61,6 +61,9 @@ _TREND_MEMORY, _PRODUCTS_MEMORY = 0.8, 0.999
 # share of its mean), over so many standard deviations to each side.
 _WIDEST_SHARE = 0.08
 _REACH_SD = 2.5
+# Larger cells are rare, not impossible: their filters lie one width of the prior apart, as a share, and their weights fall with
+# this power of the size.
+_RARITY_OF_SIZE = 3.0
 # A filter is given up when its weight falls below this share of the heaviest one's, and merged with that one when both say the
 # same, within this share of a standard deviation.
 _LEAST_LOG_WEIGHT = -15.0
@@ -80,20 +83,29 @@ def filters_of_prior(
     bounds_C: tuple[float, float],
     cell: CellParameters,
     soc: float,
+    is_size_known: bool,
 ) -> NDArray[np.void]:
     """The filters that a prior takes, before the first sample of a cell at rest."""
-    (q, r_o), sd_q = means, sds[Q]
-    half = int(np.ceil(_REACH_SD * sd_q / (_WIDEST_SHARE * q))) if sd_q > _WIDEST_SHARE * q else 0
+    (q, r_o), share = means, sds[Q] / means[Q]
+    half = int(np.ceil(_REACH_SD * share / _WIDEST_SHARE)) if share > _WIDEST_SHARE else 0
     deviations = np.linspace(-_REACH_SD, _REACH_SD, 2 * half + 1) if half else np.zeros(1)
-    q_mobile = q + sd_q * deviations
+    q_mobile, sd_q = q * (1.0 + share * deviations), np.full(len(deviations), _REACH_SD / half * sds[Q] if half else sds[Q])
+    size, log_weight = np.ones(len(deviations)), -0.5 * deviations**2
+    if half and not is_size_known:
+        log_size = np.arange(np.log1p(_REACH_SD * share), -_LEAST_LOG_WEIGHT / _RARITY_OF_SIZE, share)
+        larger = np.exp(log_size)
+        q_mobile, sd_q = np.append(q_mobile, q * larger), np.append(sd_q, sds[Q] * larger)
+        size, log_weight = np.append(size, larger), np.append(log_weight, -_RARITY_OF_SIZE * log_size)
     inside = (q_mobile >= bounds_C[0]) & (q_mobile <= bounds_C[1])
-    q_mobile, deviations = q_mobile[inside], deviations[inside]
+    q_mobile, sd_q, size, log_weight = q_mobile[inside], sd_q[inside], size[inside], log_weight[inside]
     filters = np.zeros(len(q_mobile), FILTER)
     filters["state"][:, 0] = initial_state(q_mobile, cell, soc)
     filters["tangents"][:, 0, BY_Q, QNB:] = rest_shares(soc)
-    filters["mean"] = np.column_stack([q_mobile, np.full(len(q_mobile), r_o), np.zeros(len(q_mobile))])
-    filters["covariance"] = np.diag(np.square([_REACH_SD / half * sd_q if half else sd_q, *sds[1:]]))
-    filters["log_weight"] = -0.5 * deviations**2
+    # a larger cell has less resistance
+    filters["mean"][:, Q], filters["mean"][:, R] = q_mobile, r_o / size
+    for number, sd in ((Q, sd_q), (R, sds[R] / size), (OFFSET, sds[OFFSET])):
+        filters["covariance"][:, number, number] = np.square(sd)
+    filters["log_weight"] = log_weight
     return filters
 
 

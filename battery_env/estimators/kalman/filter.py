@@ -59,7 +59,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
     from a wide prior may take to a wrong one and claim to be sure. Such a prior is divided among several filters, each of them
     weighted with the likelihood of its innovations; estimate and standard deviation are those of the mixture. Filters that
     lost their weight or agree with the heaviest one are dropped. A prior of 8 % or less, carried over from an earlier
-    discharge, takes one filter.
+    discharge, takes one filter. Where no prior is given, larger cells are rare, not impossible: they have filters too, with as
+    much less resistance.
 
     *Gate.* Innovations count in full up to 5 standard deviations, and beyond as if the noise had been larger (Huber's loss): a
     wild sample moves nothing far, and a filter that is wrong still finds back.
@@ -188,7 +189,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
         return float(mean), float(sd)
 
     def _start(self, cell: CellParameters) -> NDArray[np.void]:
-        return filters_of_prior(self._means, self._sds, self._settings.bounds[0], cell, self.initial_soc[0])
+        is_size_known = self._settings.carried[Q] != (0.0, 0.0)
+        return filters_of_prior(self._means, self._sds, self._settings.bounds[Q], cell, self.initial_soc[0], is_size_known)
 
     def reset(self) -> None:
         """Forget all samples: the next one is the first of a discharge, of a cell at rest with ``initial_soc``."""
