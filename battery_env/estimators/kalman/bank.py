@@ -61,8 +61,8 @@ _TREND_MEMORY, _PRODUCTS_MEMORY = 0.8, 0.999
 # share of its mean), over so many standard deviations to each side.
 _WIDEST_SHARE = 0.08
 _REACH_SD = 2.5
-# Larger cells are rare, not impossible: their filters lie one width of the prior apart, as a share, and their weights fall with
-# this power of the size.
+# Larger cells are rare, not impossible: their filters lie one width of the prior apart, as a share, and their weights fall
+# with this power of the size.
 _RARITY_OF_SIZE = 3.0
 # A filter is given up when its weight falls below this share of the heaviest one's, and merged with that one when both say the
 # same, within this share of a standard deviation.
