@@ -21,13 +21,15 @@ class ChargeBefore(NamedTuple):
     highest_V: float  # the cell rests below it
     last_A: float  # the current, without a sign, at which that voltage was held last
     largest_A: float  # without a sign
+    held_C: float  # what flowed while that voltage was held
 
     @classmethod
-    def of(cls, voltage_V: FloatArray, current_A: FloatArray) -> ChargeBefore:
+    def of(cls, time_s: FloatArray, voltage_V: FloatArray, current_A: FloatArray) -> ChargeBefore:
         """That of these samples."""
         size_A, held = np.abs(current_A), np.flatnonzero(voltage_V >= voltage_V.max() - _HELD_V)
+        held_C = float(size_A[held[:-1]] @ np.diff(time_s[held]))
         # the last row may already mix the charge with what follows
-        return cls(float(voltage_V.max()), float(size_A[held[-2:]].max()), float(size_A.max()))
+        return cls(float(voltage_V.max()), float(size_A[held[-2:]].max()), float(size_A.max()), held_C)
 
     @property
     def tapered(self) -> bool:
@@ -36,6 +38,11 @@ class ChargeBefore(NamedTuple):
         tester stops by a reading that it need not write.
         """
         return self.last_A <= (SWITCH_SHARE + _READ_SHARE) * self.largest_A
+
+    @property
+    def left_C(self) -> float:
+        """What the cell had left to take when a taper ended, C: the current falls exponentially while the voltage is held."""
+        return self.held_C * self.last_A / (self.largest_A - self.last_A) if self.tapered else 0.0
 
 
 class Shown(NamedTuple):

@@ -140,6 +140,24 @@ class TestCharge:
         counted = table.assign(cycle=np.where(table.current_A <= 0.0, 2, 1) if rest_rows == 0 else 1)
         assert len(read_discharges(counted)) == 1 and read_discharges(counted)[0].shown.charge is not None
 
+    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize(("last_A", "settled"), [(0.03, True), (0.1, None), (0.2, False), (0.3, False)])
+    def test_what_a_taper_left_is_in_the_standard_deviation(self, last_A, settled, method):
+        # about the charge that an exponential would have brought after its end
+        left_C = last_A * 2000.0 / np.log(3.0 / last_A)
+        (found,) = calibrate(cycled(4.2, last_A, rest_rows=1), method=method)
+        assert found.record.shown.charge.left_C == pytest.approx(left_C, rel=0.15)
+        assert found.sd_q_mobile_C > left_C and found.capacity_Ah == pytest.approx(found.drawn_Ah)
+        assert settled is None or found.settled_q_mobile == settled == ("C left to take" not in found.reason)
+
+    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize("soc", [0.99, 0.98, 0.97, 0.965])
+    def test_a_charge_cut_short_left_what_the_voltage_at_rest_shows(self, soc, method):
+        table = cycled(4.25, 3.0, rest_rows=100, soc=soc)
+        (found,), (alone,) = (calibrate(each, method=method) for each in (table, table[400:]))
+        left_C = found.q_mobile_C * (1.0 / soc - 1.0)
+        assert found.sd_q_mobile_C == pytest.approx(np.hypot(alone.sd_q_mobile_C, left_C), rel=0.3)
+
     def test_one_that_tapered_off_too_low_is_none_of_these_constants(self):
         (found,) = calibrate(cycled(4.1, 0.05, soc=0.92))
         assert not found.settled and "ended at 4.10 V" in found.reason
@@ -157,11 +175,11 @@ class TestCharge:
     )
     def test_one_that_ended_at_a_tenth_by_a_reading_before_it_tapered_off(self, share, tapered):
         current_A = -np.append(np.full(50, 3.0), 3.0 * np.linspace(share + 0.02, share, 50))
-        assert ChargeBefore.of(np.append(np.linspace(3.8, 4.2, 50), np.full(50, 4.2)), current_A).tapered == tapered
+        assert ChargeBefore.of(10.0 * np.arange(100), np.append(np.linspace(3.8, 4.2, 50), np.full(50, 4.2)), current_A).tapered == tapered
 
     def test_noise_at_its_end_is_no_taper(self):
         voltage_V, current_A = np.append(np.linspace(3.8, 4.1, 50), 4.0), -np.append(np.full(50, 3.0), 0.02)
-        assert not ChargeBefore.of(voltage_V, current_A).tapered
+        assert not ChargeBefore.of(10.0 * np.arange(51), voltage_V, current_A).tapered
 
     def test_nothing_is_known_of_other_records(self):
         assert REAL.shown == Shown() and REAL.loaded_part(2.7).shown.charge is None

@@ -41,7 +41,7 @@ PRIOR_LIMIT_SD = 2.5
 #: A full cell may rest so far below and above the model's voltage, V. Real ones of the bundled kind rest at 4.17 to 4.23 V,
 #: the model's at 4.19 V, which falls by 11 mV with each percent of the charge: a cell that lacks 4 % or more is noticed. Where
 #: that share makes less, on a flat curve, a cell may rest no farther below.
-BELOW_REST_V, ABOVE_REST_V, _LACKING_SHARE = 0.04, 0.06, 0.04
+BELOW_REST_V, ABOVE_REST_V, LACKING_SHARE = 0.04, 0.06, 0.04
 
 _AT_BOUND = "{} is at a bound of its search, where the record does not determine it."
 _DIFFERS = "The policy and the fit in its observation differ by {{differs:.1%}} in {}: it does not trust the fit."
@@ -171,6 +171,11 @@ class Condition(IntEnum):
     NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
     Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
     R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
+    TAPERED_EARLY = (
+        "The charge before the load ended while {charge_A:.3g} A still flowed: the cell had some {left_C:.0f} C left to take. "
+        "Charge until less flows, or state initial_soc (--initial-soc).",
+        "q_mobile",
+    )
     LOAD_ON_UNSURE = (
         "The load came on between two samples, nobody knows when: {load_on_C:.0f} C are in doubt. Give samples around the "
         "moment.",
@@ -296,7 +301,7 @@ def rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
 def low_rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
     """The voltage below which a cell at rest lacks charge."""
     expected_V = rest_voltage_V(cell, soc)
-    fall_V = expected_V - rest_voltage_V(cell, 1.0 - _LACKING_SHARE)
+    fall_V = expected_V - rest_voltage_V(cell, 1.0 - LACKING_SHARE)
     # another charge was stated by whoever knows it, and constants of one load need not have a curve that rises
     return expected_V - (min(BELOW_REST_V, fall_V) if soc == 1.0 and fall_V > 0.0 else BELOW_REST_V)
 

@@ -18,6 +18,7 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import (
     ABOVE_REST_V,
+    LACKING_SHARE,
     MOST_OF_SD,
     SETTLED_SHARES,
     Condition,
@@ -53,7 +54,12 @@ _MOST_SHARE = SETTLED_SHARES["q_mobile"]
 _KEPT_EVERY_S = 0.9
 
 # The start: the first sample, and within the start window the largest current and the least voltage.
-_START = table([("at_rest", "b1"), ("charge", "i8"), *((name, "f8") for name in ("first_V", "first_A", "most_A", "least_V"))])
+_START = table(
+    [
+        *(("at_rest", "b1"), ("charge", "i8"), ("is_cut_short", "b1")),
+        *((name, "f8") for name in ("first_V", "first_A", "most_A", "least_V")),
+    ]
+)
 
 # The current before the load, in the mean: since when it is over, the interval in which the load came on and the one before,
 # and the standard deviation of the charge by that.
@@ -111,6 +117,7 @@ SEEN = table(
         ("switches", SWITCHES),
         ("is_counted", "b1"),  # by the tester, which saw what lies between samples
         ("uncounted_C", "f8"),  # by how much it counted another charge
+        ("left_C", "f8"),  # what a charge before had left to take
         ("dropped_C", "f8"),  # charge of switches that were taken back, which it did not follow
         ("dropped_ohm", "f8"),  # by how much they moved an estimate of r_o
         ("fault", _FAULT),
@@ -167,13 +174,14 @@ def take_in(seen: Any, shown: Shown) -> None:
         # without a rest a charge that did not taper off tells nothing but that the cell is lower
         is_low = (charge.highest_V < seen["low_V"]) | (not charge.tapered and shown.rest_s < LEAST_REST_S)
         start["charge"] = np.where(np.isnan(full_V), 0, np.where(is_low, -1, int(charge.tapered)))
+        seen["left_C"], start["is_cut_short"] = np.where(np.isnan(full_V), 0.0, charge.left_C), not charge.tapered
     if shown.load_on_C or shown.offset_A:
         rest["is_over"], rest["mean_A"], rest["load_on_C"] = True, shown.offset_A, shown.load_on_C
 
 
 def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
     """What texts say of samples, by the names in their braces, on a clock of its own."""
-    charge, rest = charge or ChargeBefore(nan, nan, nan), seen["rest"]
+    charge, rest = charge or ChargeBefore(nan, nan, nan, nan), seen["rest"]
     fault, switch, gap = seen["fault"], seen["switch"], seen["gap"]
     end_s = clock_s + gap["end_s"]
     return start_measured(float(seen["start"]["first_V"]), float(seen["start_V"]), initial_soc) | {
@@ -188,6 +196,7 @@ def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: Charge
         "switched_C": float(switched_C(seen["switches"])),
         "switches": seen["switches"]["count"],
         "uncounted_C": seen["uncounted_C"],
+        "left_C": seen["left_C"],
         "dropped_C": seen["dropped_C"],
         "dropped_mohm": 1e3 * seen["dropped_ohm"],
         "gap_start_s": end_s - gap["length_s"],
@@ -239,7 +248,7 @@ def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: flo
         lowest_V, highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
         is_pending = switch.size_A != 0.0 and seen.fault.condition == 0
         seen.pending = is_pending and not _is_followed(seen, seen.time_s, lowest_V, highest_V, resistance_ohm)
-    _note_start(seen, voltage, current)
+    _note_start(seen, voltage, current, cell_q_mobile)
 
 
 @compiled
@@ -280,7 +289,7 @@ def unseen_C(seen: Row) -> float:
     rest = seen.rest
     beside_C = hypot(rest.load_on_C, rest.mean_A * (seen.time_s - rest.over_s)) if rest.is_over else 0.0
     between_C = hypot(gaps.doubtful_C(seen), 0.0 if seen.is_counted else switched_C(seen.switches))
-    return hypot(hypot(beside_C, seen.uncounted_C), hypot(between_C, seen.dropped_C))
+    return hypot(hypot(hypot(beside_C, seen.uncounted_C), hypot(between_C, seen.dropped_C)), seen.left_C)
 
 
 @compiled
@@ -297,6 +306,8 @@ def doubt_condition(seen: Row, sd_C: float) -> int:
         return Condition.LOAD_ON_UNSURE + 0
     if rest.is_over and abs(rest.mean_A) * (seen.time_s - rest.over_s) > most_C:
         return Condition.REST_CURRENT + 0
+    if seen.left_C > most_C:
+        return Condition.TAPERED_EARLY + 0
     if seen.uncounted_C > most_C:
         return Condition.UNCOUNTED + 0
     if seen.dropped_C > most_C:
@@ -315,9 +326,12 @@ def _least_resistance_ohm(start: Row, q_mobile: float, r_o: float) -> float:
 
 
 @compiled
-def _note_start(seen: Row, voltage: float, current: float) -> None:
+def _note_start(seen: Row, voltage: float, current: float, cell_q_mobile: float) -> None:
     start = seen.start
     if seen.samples == 1:
+        if start.is_cut_short and voltage < seen.start_V:
+            # its charge left what the voltage at rest is too low by
+            seen.left_C = LACKING_SHARE * cell_q_mobile * (seen.start_V - voltage) / (seen.start_V - seen.low_V)
         start.first_V, start.first_A, start.most_A, start.least_V = voltage, current, current, voltage
         if start.at_rest:
             start.first_A = 0.0

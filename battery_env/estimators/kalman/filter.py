@@ -38,7 +38,7 @@ _HOUR_S = 3600.0
 _DRIFT_PER_HOUR = 0.001
 _NOISE_V = 0.005
 # What reasons are made of
-_SHOWN = "start rest fault switch switches gap start_V time_s uncounted_C dropped_C dropped_ohm".split()
+_SHOWN = "start rest fault switch switches gap start_V time_s uncounted_C left_C dropped_C dropped_ohm".split()
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
