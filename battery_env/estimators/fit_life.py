@@ -15,7 +15,7 @@ from battery_env.estimators.cell_fit import RATE_PRIOR_SD
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, LIMIT_V, fit_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import Prior, Search
-from battery_env.parameters import PARAMETER_NAMES, R_O
+from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V, Record, check_record
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel
@@ -68,7 +68,7 @@ def fit_life(
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=UserWarning)  # its doubts are of one set of constants for all ages
         common = fit_cell(several, cut_off_V, start, thermal=False, limit_V=2.0 * limit_V).cell
-    reference = LeastSquares(cell=start, r_o_bounds_ohm=R_O.limits)
+    reference = LeastSquares(cell=start)
     model, errors_V, fitted = RecordModel(common), [], []
     for life in chosen:
         ages = []

@@ -235,9 +235,7 @@ class JointFit:
     def _alone(self, cell: CellParameters, d: int) -> tuple[Estimate, float]:
         """With some constants, what fits best to one discharge, and the error left (root mean square), V."""
         model, data = self.model.of_cell(cell), self.data[d]
-        estimate = LeastSquares(
-            cell=cell, thermal=model.thermal, dt_s=model.dt_s, q_mobile_bounds_C=Q_MOBILE.limits, r_o_bounds_ohm=R_O.limits
-        ).estimate(self.records[d])
+        estimate = LeastSquares(cell=cell, thermal=model.thermal, dt_s=model.dt_s).estimate(self.records[d])
         (voltage_V,) = data.at_samples([model.tangents(data.current_A, estimate.q_mobile, estimate.r_o).voltage_V])
         return estimate, _rms(voltage_V - data.voltage_V)
 
