@@ -289,8 +289,6 @@ class _Rates(NamedTuple):
     gain_slope_d: float
     left_o: float  # of the ohmic drop
     slope_o: float
-    left_n: float  # of Vsn
-    slope_n: float
     left_d0: float  # with the constants of the model
     gain_d0: float
     left_o0: float
@@ -322,16 +320,15 @@ def _rates(model: Any, logarithms: FloatArray, steps: float) -> _Rates:
     constants, dt_s = model.constants, model.dt_s
     rate_d = constants[0, BULK_RATE] + constants[0, SURFACE_RATE]
     at_rest = constants[0, BULK_RATE] / rate_d
-    factor_d, factor_o, factor_n = np.exp(logarithms[1]), np.exp(logarithms[2]), np.exp(logarithms[3])
+    factor_d, factor_o = np.exp(logarithms[1]), np.exp(logarithms[2])
     left_d0, _ = _decay(rate_d, 1.0, steps, dt_s)
     left_o0, _ = _decay(constants[0, TO_RATE], 1.0, steps, dt_s)
     left_d, slope_d = _decay(rate_d, factor_d, steps, dt_s)
     left_o, slope_o = _decay(constants[0, TO_RATE], factor_o, steps, dt_s)
-    left_n, slope_n = _decay(constants[0, TSN_RATE], factor_n, steps, dt_s)
     gain_d0 = (1.0 - at_rest) * (1.0 - left_d0) / rate_d
     gain_d = (1.0 - at_rest) * (1.0 - left_d) * factor_d / rate_d
     gain_slope_d = gain_d - (1.0 - at_rest) * slope_d * factor_d / rate_d
-    return _Rates(steps, left_d, slope_d, gain_d, gain_slope_d, left_o, slope_o, left_n, slope_n, left_d0, gain_d0, left_o0)
+    return _Rates(steps, left_d, slope_d, gain_d, gain_slope_d, left_o, slope_o, left_d0, gain_d0, left_o0)
 
 
 @inlined
