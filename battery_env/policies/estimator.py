@@ -207,9 +207,8 @@ class PolicyEstimator(OnlineEstimator):
         # two beside the first one
         if due > self._decisions and len(with_voltage(self._samples, due * self.decision_s).time_s) > 2:
             self._decide(due)
-        (q_mobile, r_o), (sd_q_mobile, sd_r_o), (settled_q, settled_r_o, reason) = self._now.tolist(), self._sd, self._verdict
-        both = settled_q and settled_r_o
-        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, both, reason, settled_q, settled_r_o, self._found)
+        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = self._now.tolist(), self._sd
+        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **self._verdict._asdict(), constants=self._found)
 
     def _follow(self, records: Sequence[Record], decision_s: float) -> CalibrationTask:
         # a data set may know its own constants, of which the policy must not learn
