@@ -26,11 +26,10 @@ from pathlib import Path
 from threading import Timer
 from typing import Any, Literal, ParamSpec
 
-import numpy as np
-
 from battery_env.estimators.cell_fit import CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.estimators.joint_fit import fit_cell
+from battery_env.estimators.search import spread_over
 from battery_env.files import check_new, finite_or_none
 from battery_env.lab.many import calibrate_all
 from battery_env.lab.readers.columns import FileFormat
@@ -489,8 +488,8 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
 
     from battery_env.plotting import plot_cell_fit, save_figure  # here, as matplotlib takes long to import
 
-    shown = np.unique(np.linspace(0, len(discharges) - 1, _MOST_SHOWN).round().astype(np.int64))
-    save_figure(plot_cell_fit(found, [discharges[n] for n in shown]), picture)
+    shown = [discharges[n] for n in spread_over(len(discharges), _MOST_SHOWN)]
+    save_figure(plot_cell_fit(found, shown), picture)
     print(f"\nwritten: {out}, {picture}")
     return NOT_SETTLED if found.doubt else SETTLED
 
