@@ -30,7 +30,7 @@ from battery_env.tasks.full_state.layout import (
     Formulation,
     Records,
 )
-from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
+from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
 from battery_env.trajectories import TrajectoryDataset
 
 # A model that was wrong for a while has moved too much or too little charge from one electrode to the other. In both
@@ -154,12 +154,7 @@ class FullStateTask(CalibrationTask):
             settings[name] = value
         return settings
 
-    def start(
-        self,
-        rows: NDArray[np.intp],
-        generators: Sequence[np.random.Generator],
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
+    def start(self, rows: Rows, generators: Generators, options: Mapping[str, Any] | None = None) -> None:
         """
         Start some cells at random points of random trajectories; as of the base class.
 
