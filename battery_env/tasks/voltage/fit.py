@@ -294,16 +294,6 @@ class _Rates(NamedTuple):
     left_o0: float
 
 
-class _Slopes(NamedTuple):
-    """The derivatives of Vsn at one reading by the logarithms of kn and tsn, and what is left after the interval before it."""
-
-    by_kn: float
-    by_tsn: float
-    steps: float
-    left: float
-    slope: float
-
-
 class _Linear(NamedTuple):
     """The part of the states that is linear in the current, at one reading; 0 stands for the constants of the model."""
 
@@ -333,17 +323,11 @@ def _rates(model: Any, logarithms: FloatArray, steps: float) -> _Rates:
 
 @inlined
 def _follow_current(
-    block: FloatArray,
-    values: FloatArray,
-    size: int,
-    r_o: float,
-    model: Any,
-    logarithms: FloatArray,
-    rates: _Rates,
-    before: _Linear,
-) -> tuple[_Linear, _Rates]:
+    block: FloatArray, values: FloatArray, size: int, r_o: float, model: Any, logarithms: FloatArray, before: _Linear
+) -> _Linear:
     # From the states of the model's constants, in the block, to those of the fit, and their derivatives
     unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to = before
+    rates = _rates(model, logarithms, block[STEPS * BLOCK])
     for k in range(size):
         if block[STEPS * BLOCK + k] != rates.steps:
             rates = _rates(model, logarithms, block[STEPS * BLOCK + k])
@@ -360,15 +344,16 @@ def _follow_current(
         block[MOVED * BLOCK + k] = block[MOVED * BLOCK + k] + unequal - unequal_0
         block[OHMIC * BLOCK + k] = ohmic
         values[_T_DIFFUSION, k], values[_TO, k] = by_t_diffusion, -r_o * by_to
-    return _Linear(unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to), rates
+    return _Linear(unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to)
 
 
 @inlined
 def _differentiate_vsn(
-    block: FloatArray, values: FloatArray, size: int, model: Any, factor: float, vsn: float, before: _Slopes
-) -> _Slopes:
+    block: FloatArray, values: FloatArray, size: int, model: Any, factor: float, vsn: float, before: tuple[float, float]
+) -> tuple[float, float]:
     # The derivatives by kn and tsn from the values that Vsn tends to, which values has by kn; returns the last ones
-    by_kn, by_tsn, steps, left, slope = before
+    by_kn, by_tsn = before
+    steps, left, slope = 0.0, 1.0, 0.0
     for k in range(size):
         if block[STEPS * BLOCK + k] != steps:
             steps = block[STEPS * BLOCK + k]
@@ -378,7 +363,7 @@ def _differentiate_vsn(
         by_kn += (1.0 - left) * (values[_KN, k] - by_kn)
         vsn += (1.0 - left) * (nominal - vsn)
         values[_KN, k], values[_TSN, k] = -by_kn, -by_tsn
-    return _Slopes(by_kn, by_tsn, steps, left, slope)
+    return by_kn, by_tsn
 
 
 @inlined
@@ -443,15 +428,15 @@ def _linearize(
             polynomial_p[k] += coefficient_V * added[j, 1 + k]
     share_n = min(model.dt_s * own[0, TSN_RATE] / np.exp(logarithms[3]), 0.99)
     share_p = model.dt_s * own[0, TSP_RATE]
-    linear, rates, overpotentials = _Linear(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), _rates(model, logarithms, 1.0), AT_REST
-    by_constants, moved_before, drawn_C = _Slopes(0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 0.0
+    linear, overpotentials = _Linear(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), AT_REST
+    by_constants, moved_before, drawn_C = (0.0, 0.0), 0.0, 0.0
     sums[:] = 0.0
     for low in range(0, end, BLOCK):
         size = min(BLOCK, end - low)
         take_readings(block, shown, n, low, size)
         for k in range(size):
             drawn_C += block[CURRENT * BLOCK + k] * block[STEPS * BLOCK + k] * model.dt_s
-        linear, rates = _follow_current(block, values, size, r, model, logarithms, rates, linear)
+        linear = _follow_current(block, values, size, r, model, logarithms, linear)
         padded = pad_block(block, size, moved_before)
         moved_before = block[MOVED * BLOCK + size - 1]
         nominal_overpotentials_of_block(block, padded, q, own)
