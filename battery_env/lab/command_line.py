@@ -403,7 +403,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) ->
     if settings.policy is not None:
         made_with["policy"] = sha256(settings.policy.read_bytes()).hexdigest()
     results = Results(options.out, sources, not options.table_only, settings, made_with)
-    with results.opened(sources, options.force):
+    with results.opened(options.force):
         return _calibrate(sources, settings, file_format, options, results)
 
 
