@@ -24,7 +24,6 @@ from battery_env.electrochemistry.kernels import (
     fill_block,
     states_of_block,
     step_of_block,
-    voltage_of_block,
 )
 from battery_env.tasks.full_state.layout import Records
 
@@ -117,19 +116,6 @@ def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray
             cell.voltage = block[VOLTAGE + j]
             cell.soc = (cell.state[QNB] + cell.state[QNS]) / cell.q_mobile
         states_of_block(block, first, size, cells["next_state"])
-
-
-@compiled
-def model_voltage(settings: Records, cells: Records, out: FloatArray) -> None:
-    task, block = settings[0], np.empty(BLOCK_SIZE)
-    for first in range(0, len(cells), BLOCK):
-        size = min(BLOCK, len(cells) - first)
-        fill_block(
-            block, first, size, cells["model_state"], cells["load"], cells["q_mobile_hat"], cells["r_o_hat"], task.constants
-        )
-        voltage_of_block(block, size, True, task.polynomial_n, task.polynomial_p)
-        for j in range(size):
-            out[first + j] = block[VOLTAGE + j]
 
 
 @compiled

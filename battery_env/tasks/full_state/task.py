@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from battery_env.arrays import IntArray
 from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import NEW_CELL, FloatArray, Trajectory
+from battery_env.electrochemistry.kernels import voltage_batch
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
-from battery_env.tasks.full_state.kernels import decide, look_ahead, model_voltage, observe
+from battery_env.tasks.full_state.kernels import decide, look_ahead, observe
 from battery_env.tasks.full_state.layout import (
     CELL,
     CELL_WITH_CONSTANTS,
@@ -287,5 +288,5 @@ class FullStateTask(CalibrationTask):
     def report(self) -> dict[str, FloatArray]:
         """Where each cell stands after its last decision."""
         voltage_hat = np.empty(self.cells)
-        model_voltage(self._settings, self.now, voltage_hat)
+        voltage_batch(self.now["model_state"], self.now["q_mobile_hat"], True, self.dataset.cell.packed, voltage_hat)
         return {name: voltage_hat if name == "voltage_hat" else self.now[name].copy() for name in self.REPORTED}
