@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled, inlined
-from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE, VO
+from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE, VO, PackedConstants
 from battery_env.electrochemistry.kernels import (
     BLOCK,
     BLOCK_SIZE,
@@ -23,6 +23,7 @@ from battery_env.electrochemistry.kernels import (
     asinh_ratio,
     fill_block,
     states_of_block,
+    step_batch,
     step_of_block,
 )
 from battery_env.tasks.full_state.layout import Records
@@ -79,26 +80,22 @@ def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> float
 @compiled
 def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArray) -> None:
     # Set the model's parameters, step it, and compare it with the measured state; then go on to the next sample
-    task, block = settings[0], np.empty(BLOCK_SIZE)
+    task = settings[0]
     state, next_state, model_state = cells["state"], cells["next_state"], cells["model_state"]
     for n in range(len(cells)):
         cells[n].decisions += 1
         cells[n].sample += 1
         cost[n] = task.consistency * _take_action(action, task, cells, n)
-    for first in range(0, len(cells), BLOCK):
-        size = min(BLOCK, len(cells) - first)
-        fill_block(
-            block, first, size, cells["model_state"], cells["load"], cells["q_mobile_hat"], cells["r_o_hat"], task.constants
-        )
-        step_of_block(block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p)
-        states_of_block(block, first, size, cells["model_state"])
-        for n in range(first, first + size):
-            cost[n] += _cost_of_state(model_state, next_state, n, task)
-            is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
-            for k in range(STATE_SIZE):
-                state[n, k] = next_state[n, k]
-                if is_set:
-                    model_state[n, k] = next_state[n, k]
+    load, q, r_o = cells["load"], cells["q_mobile_hat"], cells["r_o_hat"]
+    packed = PackedConstants(task.constants, task.polynomial_n, task.polynomial_p)
+    step_batch(model_state, load, q, r_o, task.dt_s, task.power, task.thermal, True, packed, model_state)
+    for n in range(len(cells)):
+        cost[n] += _cost_of_state(model_state, next_state, n, task)
+        is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
+        for k in range(STATE_SIZE):
+            state[n, k] = next_state[n, k]
+            if is_set:
+                model_state[n, k] = next_state[n, k]
 
 
 @compiled
