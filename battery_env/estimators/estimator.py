@@ -16,7 +16,7 @@ from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, s
 from battery_env.electrochemistry.ends import BAND, LONGEST_S, Cells, run_down
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
 from battery_env.estimators.state_files import Saved
-from battery_env.loads import KnownLoad, Load, in_steps, known_load
+from battery_env.loads import KnownLoad, Load, known_load
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
@@ -177,7 +177,7 @@ class OnlineEstimator(Saved, Estimator):
             [middle, *(middle + share[:, None] * each for share, each in zip(shares, now.deviations, strict=True))]
         )
         end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
-        ends_s = run_down(_cells_at(points), now, in_steps([given], dt_s), end_V).time_s
+        ends_s = run_down(_cells_at(points), now, [given], end_V).time_s
         if given_s < min(ends_s[0], LONGEST_S):
             raise ValueError(
                 f"load ends after {given_s:g} s, before the discharge does. Append what is to come, or "

@@ -23,7 +23,6 @@ from battery_env.loads import (
     Load,
     LoadToCome,
     RandomLoad,
-    in_steps,
     known_load,
     steadier_unit,
 )
@@ -240,10 +239,10 @@ def forecast(
         now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
     else:
         now_s = float(seen.time_s[-1])
-        ends = run_down(cells, model, in_steps(draws[-samples:], model.dt_s), cut_off, _COURSE_S)
+        ends = run_down(cells, model, draws[-samples:], cut_off, _COURSE_S)
     if nominal_Ah is None:
         # the mean over loads: under a single draw, health would be a matter of that draw. No charge takes a cell to its end
-        given_Ah = model.capacity_Ah(in_steps(draws[:_NOMINAL_DRAWS], model.dt_s), cut_off)
+        given_Ah = model.capacity_Ah(draws[:_NOMINAL_DRAWS], cut_off)
         nominal_Ah = float(given_Ah[given_Ah > 0.0].mean()) if (given_Ah > 0.0).any() else float("nan")
     return Forecast(
         record=seen,
