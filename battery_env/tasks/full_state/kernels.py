@@ -118,7 +118,7 @@ def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray
 @compiled
 def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.float32]) -> None:
     # The observations, into out
-    task, block = settings[0], np.empty(BLOCK_SIZE)
+    task = settings[0]
     per_state, per_error, model_state, next_state = task.per_state, task.per_error, cells["model_state"], cells["next_state"]
     for n in range(len(cells)):
         cell = cells[n]
@@ -135,21 +135,18 @@ def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.flo
     if not task.innovations:
         return
     q, r_o = np.full(len(cells), task.new_parameters[0]), np.full(len(cells), task.new_parameters[1])
+    packed = PackedConstants(task.constants, task.polynomial_n, task.polynomial_p)
+    predicted = np.empty((len(cells), STATE_SIZE))
+    innovations = predicted.ravel()
     for column, origin in ((15, model_state), (22, cells["state"])):
-        for first in range(0, len(cells), BLOCK):
-            size = min(BLOCK, len(cells) - first)
-            fill_block(block, first, size, origin, cells["load"], q, r_o, task.constants)
-            step_of_block(
-                block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p
-            )
-            for j in range(size):
-                for k in range(1, 8):
-                    block[k * BLOCK + j] = (next_state[first + j, k] - block[k * BLOCK + j]) * per_error[k - 1]
-            # asinh: they span five orders of magnitude, and must not drown the small ones in a network. A loop of its own, so
-            # that the compiler uses vector instructions
-            for k in range(1, 8):
-                for j in range(size):
-                    block[k * BLOCK + j] = asinh_ratio(block[k * BLOCK + j], 1.0)
-            for j in range(size):
-                for k in range(7):
-                    out[first + j, k + column] = block[(k + 1) * BLOCK + j]
+        step_batch(origin, cells["load"], q, r_o, task.dt_s, task.power, task.thermal, True, packed, predicted)
+        for n in range(len(cells)):
+            for k in range(7):
+                predicted[n, k + 1] = (next_state[n, k + 1] - predicted[n, k + 1]) * per_error[k]
+        # asinh: they span five orders of magnitude, and must not drown the small ones in a network. A loop of its own, so that
+        # the compiler uses vector instructions
+        for j in range(len(innovations)):
+            innovations[j] = asinh_ratio(innovations[j], 1.0)
+        for n in range(len(cells)):
+            for k in range(7):
+                out[n, k + column] = predicted[n, k + 1]
