@@ -13,15 +13,7 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.cell import CellParameters, PackedConstants
-from battery_env.electrochemistry.kernels import (
-    BLOCK,
-    BLOCK_SIZE,
-    LOAD,
-    VOLTAGE,
-    fill_block,
-    states_of_block,
-    step_of_block,
-)
+from battery_env.electrochemistry.kernels import BLOCK, BLOCK_SIZE, LOAD, VOLTAGE, fill_block, states_of_block, step_of_block
 from battery_env.electrochemistry.simulation import state_of_charge, voltage_into
 
 #: The ends and the middle of the intervals that are shown: nine of ten outcomes lie between the outer two.

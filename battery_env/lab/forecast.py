@@ -16,16 +16,7 @@ from battery_env.electrochemistry.ends import BAND, Cells, Ends, follow, quantil
 from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.conditions import white_noise_V
 from battery_env.estimators.estimator import ModelNow
-from battery_env.loads import (
-    BlockBootstrap,
-    Cycle,
-    KnownLoad,
-    Load,
-    LoadToCome,
-    RandomLoad,
-    known_load,
-    steadier_unit,
-)
+from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, LoadToCome, RandomLoad, known_load, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records import CUT_OFF_V, Record, Samples, check_record, expected_current
 from battery_env.records.model import RECENT_SHARE, RecordModel

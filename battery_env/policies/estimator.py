@@ -23,15 +23,7 @@ from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, 
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
 from battery_env.policies.readings import columns, on_grid, with_voltage
-from battery_env.records import (
-    Samples,
-    Shown,
-    check_drawn_charge,
-    check_record,
-    check_sample,
-    drawn_charge_C,
-    shown_beside,
-)
+from battery_env.records import Samples, Shown, check_drawn_charge, check_record, check_sample, drawn_charge_C, shown_beside
 from battery_env.records.model import RecordModel
 from battery_env.tasks.env import CalibrationEnv, task_class
 from battery_env.tasks.task import CalibrationTask

@@ -26,12 +26,7 @@ from battery_env.electrochemistry import (
     simulate,
 )
 from battery_env.electrochemistry.ends import LONGEST_S, Cells, ToCome, run_down
-from battery_env.electrochemistry.tangents import (
-    TANGENT_NAMES,
-    PolynomialDerivatives,
-    least_q_mobile,
-    roll_out_with_tangents,
-)
+from battery_env.electrochemistry.tangents import TANGENT_NAMES, PolynomialDerivatives, least_q_mobile, roll_out_with_tangents
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records.samples import Record, check_record, expected_current, resample_current
