@@ -150,33 +150,10 @@ def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> d
     return dict(content)
 
 
-def save_npz(
-    path: str | os.PathLike[str],
-    kind: str,
-    version: int,
-    arrays: Mapping[str, NDArray[Any]],
-    settings: Mapping[str, Any],
-) -> Path:
-    """Write arrays, and settings as JSON, to a new npz file that says what it holds; no pickle."""
-    target = npz_path(path)
-    metadata = json.dumps({**settings, "kind": kind, "format": version})
-    with replacing(target, new=True) as part:
-        np.savez_compressed(part, metadata=np.array(metadata), **arrays)  # type: ignore[arg-type]  # none is named allow_pickle
-    return target
-
-
 def npz_path(path: str | os.PathLike[str]) -> Path:
     """The path with the suffix .npz, which is added if it is missing."""
     target = Path(path)
     return target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
-
-
-def load_npz(path: str | os.PathLike[str], kind: str, version: int) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Read the arrays and the settings that :func:`save_npz` wrote."""
-    arrays, settings = read_npz(path, kind)
-    if settings["format"] != version:
-        raise ValueError(f"{path} has format {settings['format']}, this version reads {version}: make it again")
-    return arrays, settings
 
 
 def read_npz(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_load, check_numbers, check_positive, check_range
-from battery_env.electrochemistry.ends import Loads
 from battery_env.records import SWITCH_SHARE, Record, drawn, resample_current
 
 _MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
@@ -214,17 +213,6 @@ def known_load(load: Any, unit: LoadUnit) -> KnownLoad:
             "Give Load(time_s, value, unit), with time_s from 0 at the end of the record."
         )
     return constant(float(value), unit)
-
-
-def in_steps(loads: Sequence[KnownLoad], dt_s: float) -> Loads:
-    """
-    Loads, one for all cells or one a cell, all in one unit, for simulations in steps, over each of which their mean flows.
-    """
-
-    def over(time_s: FloatArray, cells: IntArray) -> FloatArray:
-        return np.array([loads[n].mean(time_s, dt_s) for n in (cells if len(loads) > 1 else [0])], dtype=np.float64)
-
-    return Loads(over, loads[0].unit, np.array([each.until_s for each in loads]))
 
 
 def constant(value: float, unit: LoadUnit = "power") -> Load:

@@ -278,9 +278,7 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
         lower.axhline(0.0, color="0.6", lw=0.8)
         errors_mV = []
         for name, (cell, style, colour) in cells.items():
-            calibrator = LeastSquares(
-                cell=cell, thermal=fit.thermal, q_mobile_bounds_C=Q_MOBILE.limits, r_o_bounds_ohm=R_O.limits
-            )
+            calibrator = LeastSquares(cell=cell, thermal=fit.thermal)
             model_V = calibrator.model.voltage(record, calibrator.estimate(record))
             error_mV = 1e3 * (model_V - record.voltage_V)
             errors_mV.append(float(np.sqrt(np.nanmean(error_mV**2))))

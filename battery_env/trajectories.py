@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 from collections.abc import Iterator, Sequence
@@ -32,7 +33,7 @@ from battery_env.electrochemistry import (
 from battery_env.electrochemistry.aging_path import EQUILIBRIUM_SIZE, AgingPath
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.kernels import roll_out
-from battery_env.files import load_npz, save_npz
+from battery_env.files import npz_path, read_npz, replacing
 from battery_env.loads import Load, LoadSampler, constant
 from battery_env.parameters import Q_MOBILE, R_O, check_parameters
 
@@ -456,7 +457,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": version("numba")}
         settings = {**{name: getattr(self, name) for name in _SETTINGS}, "cell": asdict(self.cell), "versions": versions}
-        return save_npz(path, _KIND, _FORMAT, {name: getattr(self, name) for name in _ARRAYS}, settings)
+        target, metadata = npz_path(path), json.dumps({**settings, "kind": _KIND, "format": _FORMAT})
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
+        with replacing(target, new=True) as part:
+            np.savez_compressed(part, metadata=np.array(metadata), **arrays)
+        return target
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TrajectoryDataset:
@@ -466,7 +471,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param path: the npz file
         :raises ValueError: if the file is damaged, no such data set, or of another format version
         """
-        arrays, settings = load_npz(path, _KIND, _FORMAT)
+        arrays, settings = read_npz(path, _KIND)
+        if settings["format"] != _FORMAT:
+            raise ValueError(f"{path} has format {settings['format']}, this version reads {_FORMAT}: make it again")
         try:
             constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings["cell"].items()}
             fields: dict[str, Any] = {name: arrays[name] for name in _ARRAYS} | {name: settings[name] for name in _SETTINGS}

@@ -32,14 +32,12 @@ from battery_env.electrochemistry.cell import FULL_CHARGE_SHARES as FULL_CHARGE_
 from battery_env.electrochemistry.cell import NEW_CELL as NEW_CELL
 from battery_env.electrochemistry.cell import QNB as QNB
 from battery_env.electrochemistry.cell import QNS as QNS
-from battery_env.electrochemistry.cell import QPB as QPB
 from battery_env.electrochemistry.cell import QPS as QPS
 from battery_env.electrochemistry.cell import STATE_NAMES as STATE_NAMES
 from battery_env.electrochemistry.cell import STATE_SIZE as STATE_SIZE
 from battery_env.electrochemistry.cell import TB as TB
 from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS as UNCERTAIN_CONSTANTS
 from battery_env.electrochemistry.cell import VO as VO
-from battery_env.electrochemistry.cell import VSN as VSN
 from battery_env.electrochemistry.cell import VSP as VSP
 from battery_env.electrochemistry.cell import CellParameters as CellParameters
 from battery_env.electrochemistry.cell import PackedConstants as PackedConstants

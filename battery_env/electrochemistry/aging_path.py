@@ -227,13 +227,7 @@ def _normal_distances(squares: FloatArray, count: int) -> FloatArray:
 
 
 def cell_with(cell: CellParameters, constants: Mapping[str, float] | None) -> CellParameters:
-    """
-    A cell with constants that were found along a path.
-
-    :param cell: the constants that they are told from
-    :param constants: as an estimate has them, by ``PATH_NAMES``; ``None``: none
-    :return: the cell
-    """
+    """A cell with constants that were found along a path, told from its own by ``PATH_NAMES``; ``None``: none were."""
     if constants is None:
         return cell
     rates = {name: getattr(cell, name) * float(np.exp(constants[name])) for name in UNCERTAIN_CONSTANTS}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from math import exp, sqrt
 from typing import NamedTuple, Protocol
 
@@ -13,15 +13,7 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.cell import CellParameters, PackedConstants
-from battery_env.electrochemistry.kernels import (
-    BLOCK,
-    BLOCK_SIZE,
-    LOAD,
-    VOLTAGE,
-    fill_block,
-    states_of_block,
-    step_of_block,
-)
+from battery_env.electrochemistry.kernels import BLOCK, BLOCK_SIZE, LOAD, VOLTAGE, fill_block, states_of_block, step_of_block
 from battery_env.electrochemistry.simulation import state_of_charge, voltage_into
 
 #: The ends and the middle of the intervals that are shown: nine of ten outcomes lie between the outer two.
@@ -81,15 +73,16 @@ class Cells(NamedTuple):
         return Cells(*(column[chosen] for column in self))
 
 
-class Loads(NamedTuple):
-    """
-    What is to come: over steps that start at some times, s, shape (K,), and for some of the cells, the load in W or A, shape
-    (cells, K), or (1, K) where all have the same.
-    """
+class ToCome(Protocol):
+    """What a cell is to deliver, as loads are: in W or A, until when it draws anything at all, and its mean over steps, s."""
 
-    over: Callable[[FloatArray, IntArray], FloatArray]
-    unit: LoadUnit  # "power" in W or "current" in A
-    until_s: FloatArray  # nothing is drawn any more then, s, shape (n,) or (1,); infinite: not known
+    @property
+    def unit(self) -> LoadUnit: ...
+
+    @property
+    def until_s(self) -> float: ...
+
+    def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray: ...
 
 
 class Ends(NamedTuple):
@@ -113,24 +106,25 @@ def quantile(values: FloatArray, probability: ArrayLike = BAND) -> FloatArray:
 def run_down(
     cells: Cells,
     model: Model,
-    loads: Loads,
+    loads: Sequence[ToCome],
     cut_off_V: float,
     every_s: float | None = None,
     surplus_share: float = SURPLUS_SHARE,
 ) -> Ends:
     """
-    The one way to the end of a discharge: take cells down to the cut-off, side by side, for a week at most. The course of the
-    voltage is kept every so often, s, if at all. A load that charges a cell further beyond full than a share of its charge is
-    refused.
+    The one way to the end of a discharge: take cells down to the cut-off, side by side, for a week at most, under loads in one
+    unit, one for all or one a cell. The course of the voltage is kept every so often, s, if at all. A load that charges a cell
+    further beyond full than a share of its charge is refused.
     """
-    count, dt_s, power = len(cells.q_mobile), model.dt_s, loads.unit == "power"
-    until = np.broadcast_to(np.ceil(np.minimum(loads.until_s, LONGEST_S) / dt_s - 1e-9), count)
+    count, dt_s, power = len(cells.q_mobile), model.dt_s, loads[0].unit == "power"
+    until = np.broadcast_to(np.ceil(np.minimum([each.until_s for each in loads], LONGEST_S) / dt_s - 1e-9), count)
     followed = _followed(cells, until)
     every = 0 if every_s is None else max(round(every_s / dt_s), 1)
     course: list[tuple[IntArray, FloatArray]] = []
     first, going, state = 0, np.arange(count), cells.state.copy()
     while len(going):
-        load = loads.over(dt_s * np.arange(first, first + _CHUNK_STEPS, dtype=np.float64), going)
+        starts_s = dt_s * np.arange(first, first + _CHUNK_STEPS, dtype=np.float64)
+        load = np.array([loads[n].mean(starts_s, dt_s) for n in (going.tolist() if len(loads) > 1 else [0])], dtype=np.float64)
         rows = np.arange(-first % every, _CHUNK_STEPS, every) if every else np.arange(0)
         shown_V, part, ahead = np.full((count, len(rows)), cut_off_V), followed.take(going, axis=1), state[going]
         places, limits = (first, every), (cut_off_V, surplus_share, MEMORY_SHARE)

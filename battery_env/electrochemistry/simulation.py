@@ -165,11 +165,9 @@ def advance_in_place(
     state[order] = ahead
 
 
-def voltage_into(
-    out: FloatArray, state: FloatArray, q_mobile: FloatArray, packed: PackedConstants, extended: bool = False
-) -> None:
+def voltage_into(out: FloatArray, state: FloatArray, q_mobile: FloatArray, packed: PackedConstants) -> None:
     """:func:`voltage` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64."""
-    voltage_batch(state, q_mobile, extended, packed, out)
+    voltage_batch(state, q_mobile, False, packed, out)
 
 
 def state_of_charge(state: FloatArray, q_mobile: FloatArray) -> FloatArray:

@@ -1,10 +1,10 @@
 """
 The derivatives of the model with respect to its parameters at a given current: its equations, differentiated.
 
-A tangent is the derivative of a state. The tangents of n cells have the shape (n, 2, 8) or (n, 8, 8): each cell has rows in
-the order of ``TANGENT_NAMES``, with respect to ``q_mobile`` and ``r_o`` and, if asked for, to the logarithms of the constants
-that say how fast the cell follows its load. The charges are linear in ``q_mobile``, so that their tangents hold at any
-distance. All cells share one row of constants.
+A tangent is the derivative of a state. The state of a cell is the only row of ``x``, as the kernels of the model take rows of
+arrays. Its tangents ``dx`` have the shape (1, 2, 8) or (1, 8, 8), with rows in the order of ``TANGENT_NAMES``: with respect to
+``q_mobile`` and ``r_o`` and, if asked for, to the logarithms of the constants that say how fast the cell follows its load. The
+charges are linear in ``q_mobile``, so that their tangents hold at any distance.
 """
 
 from __future__ import annotations
@@ -111,63 +111,56 @@ def overpotential_slopes(i: float, xn: float, xp: float, tb: float, constants: F
 
 
 @inlined
-def _fractions(x: FloatArray, n: int, q: float, extended: bool, constants: FloatArray) -> tuple[float, float]:
-    # at both surfaces of row n of x
-    return mole_fraction(x[n, QNS], q, extended, constants), mole_fraction(x[n, QPS], q, extended, constants)
+def _fractions(x: FloatArray, q: float, extended: bool, constants: FloatArray) -> tuple[float, float]:
+    # at both surfaces
+    return mole_fraction(x[0, QNS], q, extended, constants), mole_fraction(x[0, QPS], q, extended, constants)
 
 
 @inlined
-def _fraction_tangents(dx: FloatArray, n: int, xn: float, xp: float, q: float, constants: FloatArray) -> tuple[float, float]:
+def _fraction_tangents(dx: FloatArray, xn: float, xp: float, q: float, constants: FloatArray) -> tuple[float, float]:
     # of xn and xp with respect to q; they do not depend on r_o
     share = constants[0, FRACTION_PER_SHARE] / q
-    return share * dx[n, BY_Q, QNS] - xn / q, share * dx[n, BY_Q, QPS] - xp / q
+    return share * dx[0, BY_Q, QNS] - xn / q, share * dx[0, BY_Q, QPS] - xp / q
 
 
 @inlined
-def _rate_fraction_tangents(dx: FloatArray, n: int, row: int, q: float, constants: FloatArray) -> tuple[float, float]:
+def _rate_fraction_tangents(dx: FloatArray, row: int, q: float, constants: FloatArray) -> tuple[float, float]:
     # of xn and xp with respect to the logarithm of a rate constant; only tDiffusion moves them
-    dxn = mole_fraction(dx[n, row, QNS], q, False, constants)
-    return dxn, mole_fraction(dx[n, row, QPS], q, False, constants)
+    dxn = mole_fraction(dx[0, row, QNS], q, False, constants)
+    return dxn, mole_fraction(dx[0, row, QPS], q, False, constants)
 
 
 @inlined
 def _voltage_slopes(
-    x: FloatArray, n: int, q: float, thermal: bool, packed: PackedConstants, derivatives: PolynomialDerivatives
+    x: FloatArray, q: float, thermal: bool, packed: PackedConstants, derivatives: PolynomialDerivatives
 ) -> tuple[float, float, float, float, float]:
-    # The mole fractions at the surfaces of row n of x, and the slopes of its voltage by them and by the temperature
-    constants, tb = packed.constants, x[n, TB]
-    xn, xp = _fractions(x, n, q, False, constants)
+    # The mole fractions at both surfaces, and the slopes of the voltage by them and by the temperature
+    constants, tb = packed.constants, x[0, TB]
+    xn, xp = _fractions(x, q, False, constants)
     v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, derivatives)
     return xn, xp, v_xn, v_xp, constants[0, R_OVER_F] * nernst_logarithm(xn, xp) if thermal else 0.0
 
 
 @inlined
-def _voltage_tangent(dx: FloatArray, n: int, row: int, by_fractions: float, v_tb: float) -> float:
+def _voltage_tangent(dx: FloatArray, row: int, by_fractions: float, v_tb: float) -> float:
     # by_fractions: what the voltage changes by as the mole fractions do
-    return by_fractions - dx[n, row, VO] - dx[n, row, VSN] - dx[n, row, VSP] + v_tb * dx[n, row, TB]
+    return by_fractions - dx[0, row, VO] - dx[0, row, VSN] - dx[0, row, VSP] + v_tb * dx[0, row, TB]
 
 
 @inlined
 def voltage_tangents(
-    x: FloatArray,
-    dx: FloatArray,
-    n: int,
-    q: float,
-    thermal: bool,
-    packed: PackedConstants,
-    derivatives: PolynomialDerivatives,
+    x: FloatArray, dx: FloatArray, q: float, thermal: bool, packed: PackedConstants, derivatives: PolynomialDerivatives
 ) -> tuple[float, float]:
-    # The derivatives of the voltage of row n of x with respect to q and r_o; the cell has a voltage
-    xn, xp, v_xn, v_xp, v_tb = _voltage_slopes(x, n, q, thermal, packed, derivatives)
-    dxn, dxp = _fraction_tangents(dx, n, xn, xp, q, packed.constants)
-    return _voltage_tangent(dx, n, BY_Q, v_xn * dxn + v_xp * dxp, v_tb), _voltage_tangent(dx, n, BY_R, 0.0, v_tb)
+    # The derivatives of the voltage with respect to q and r_o; the cell has a voltage
+    xn, xp, v_xn, v_xp, v_tb = _voltage_slopes(x, q, thermal, packed, derivatives)
+    dxn, dxp = _fraction_tangents(dx, xn, xp, q, packed.constants)
+    return _voltage_tangent(dx, BY_Q, v_xn * dxn + v_xp * dxp, v_tb), _voltage_tangent(dx, BY_R, 0.0, v_tb)
 
 
 @compiled
 def _voltage_rate_tangents(
     x: FloatArray,
     dx: FloatArray,
-    n: int,
     q: float,
     thermal: bool,
     packed: PackedConstants,
@@ -176,71 +169,63 @@ def _voltage_rate_tangents(
     k: int,
 ) -> None:
     # Likewise with respect to the logarithms of RATE_CONSTANTS, into column k of by_parameter
-    _, _, v_xn, v_xp, v_tb = _voltage_slopes(x, n, q, thermal, packed, derivatives)
+    _, _, v_xn, v_xp, v_tb = _voltage_slopes(x, q, thermal, packed, derivatives)
     for row in range(BY_KN, dx.shape[1]):
-        dxn, dxp = _rate_fraction_tangents(dx, n, row, q, packed.constants)
-        by_parameter[row, k] = _voltage_tangent(dx, n, row, v_xn * dxn + v_xp * dxp, v_tb)
+        dxn, dxp = _rate_fraction_tangents(dx, row, q, packed.constants)
+        by_parameter[row, k] = _voltage_tangent(dx, row, v_xn * dxn + v_xp * dxp, v_tb)
 
 
 @inlined
 def voltage_curvature(
-    x: FloatArray, dx: FloatArray, n: int, q: float, packed: PackedConstants, derivatives: PolynomialDerivatives
+    x: FloatArray, dx: FloatArray, q: float, packed: PackedConstants, derivatives: PolynomialDerivatives
 ) -> float:
-    # The second derivative of the voltage of row n of x with respect to q along the tangent of its state
-    constants, tb = packed.constants, x[n, TB]
-    xn, xp = _fractions(x, n, q, False, constants)
-    dxn, dxp = _fraction_tangents(dx, n, xn, xp, q, constants)
+    # The second derivative of the voltage with respect to q along the tangent of the state
+    constants, tb = packed.constants, x[0, TB]
+    xn, xp = _fractions(x, q, False, constants)
+    dxn, dxp = _fraction_tangents(dx, xn, xp, q, constants)
     v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, derivatives)
     v_xn_xn, v_xp_xp = equilibrium_curvatures(xn, xp, tb, constants, derivatives)
     # of a charge that is linear in q, over q
     of_fractions = v_xn_xn * dxn * dxn + v_xp_xp * dxp * dxp - 2.0 * (v_xn * dxn + v_xp * dxp) / q
-    nernst = constants[0, R_OVER_F] * dx[n, BY_Q, TB]
+    nernst = constants[0, R_OVER_F] * dx[0, BY_Q, TB]
     return of_fractions + 2.0 * nernst * (dxn / (xn * (1.0 - xn)) - dxp / (xp * (1.0 - xp)))
 
 
 @inlined
-def _diffuse(dx: FloatArray, n: int, row: int, dt: float, constants: FloatArray) -> None:
+def _diffuse(dx: FloatArray, row: int, dt: float, constants: FloatArray) -> None:
     # one row of the tangents of the charges over a step; the current does not depend on parameters
     for bulk, surface in ((QNB, QNS), (QPB, QPS)):
-        moved = dt * diffusion(dx[n, row, bulk], dx[n, row, surface], constants[0, BULK_RATE], constants[0, SURFACE_RATE])
-        dx[n, row, bulk] -= moved
-        dx[n, row, surface] += moved
+        moved = dt * diffusion(dx[0, row, bulk], dx[0, row, surface], constants[0, BULK_RATE], constants[0, SURFACE_RATE])
+        dx[0, row, bulk] -= moved
+        dx[0, row, surface] += moved
 
 
 @inlined
-def _diffuse_slower(dx: FloatArray, n: int, row: int, charges: FloatArray, dt: float, constants: FloatArray) -> None:
+def _diffuse_slower(dx: FloatArray, row: int, charges: FloatArray, dt: float, constants: FloatArray) -> None:
     # what is moved of these charges over a step, differentiated by the logarithm of tDiffusion: its rate falls
     for bulk, surface in ((QNB, QNS), (QPB, QPS)):
         moved = dt * diffusion(charges[bulk], charges[surface], constants[0, BULK_RATE], constants[0, SURFACE_RATE])
-        dx[n, row, bulk] += moved
-        dx[n, row, surface] -= moved
+        dx[0, row, bulk] += moved
+        dx[0, row, surface] -= moved
 
 
 @inlined
 def _follow(
-    dx: FloatArray,
-    n: int,
-    row: int,
-    i: float,
-    nominal: tuple[float, float, float],
-    dt: float,
-    thermal: bool,
-    constants: FloatArray,
+    dx: FloatArray, row: int, i: float, nominal: tuple[float, float, float], dt: float, thermal: bool, constants: FloatArray
 ) -> None:
     # one row of the tangents of the voltage drops and of the temperature over a step; nominal: of what the drops tend to
-    dvo, dvsn, dvsp = dx[n, row, VO], dx[n, row, VSN], dx[n, row, VSP]
-    dx[n, row, VO] += dt * (nominal[0] - dvo) * constants[0, TO_RATE]
-    dx[n, row, VSN] += dt * (nominal[1] - dvsn) * constants[0, TSN_RATE]
-    dx[n, row, VSP] += dt * (nominal[2] - dvsp) * constants[0, TSP_RATE]
+    dvo, dvsn, dvsp = dx[0, row, VO], dx[0, row, VSN], dx[0, row, VSP]
+    dx[0, row, VO] += dt * (nominal[0] - dvo) * constants[0, TO_RATE]
+    dx[0, row, VSN] += dt * (nominal[1] - dvsn) * constants[0, TSN_RATE]
+    dx[0, row, VSP] += dt * (nominal[2] - dvsp) * constants[0, TSP_RATE]
     if thermal:
-        dx[n, row, TB] += dt * ((dvo + dvsn + dvsp) * i * constants[0, WARMING] - dx[n, row, TB] * constants[0, COOLING])
+        dx[0, row, TB] += dt * ((dvo + dvsn + dvsp) * i * constants[0, WARMING] - dx[0, row, TB] * constants[0, COOLING])
 
 
 @inlined
 def step_with_tangents(
     x: FloatArray,
     dx: FloatArray,
-    n: int,
     i: float,
     q: float,
     r_o: float,
@@ -249,47 +234,47 @@ def step_with_tangents(
     extended: bool,
     constants: FloatArray,
 ) -> None:
-    # One step of row n of x and of its tangents with respect to q and r_o, in place
-    tb = x[n, TB]
-    xn, xp = _fractions(x, n, q, extended, constants)
+    # One step of the state and of its tangents with respect to q and r_o, in place
+    tb = x[0, TB]
+    xn, xp = _fractions(x, q, extended, constants)
     vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants)
     vsn_tb, vsp_tb = 0.0, 0.0
     if thermal:
         vsn, vsp = nominal_overpotentials(i, xn, xp, tb, constants)
         vsn_tb, vsp_tb = vsn / tb, vsp / tb
-    dxn, dxp = _fraction_tangents(dx, n, xn, xp, q, constants)
+    dxn, dxp = _fraction_tangents(dx, xn, xp, q, constants)
     # what a parameter does at a given state: to the mole fractions, and to the ohmic drop
     for row, by_xn, by_xp, dvo_nominal in ((BY_Q, vsn_xn * dxn, vsp_xp * dxp, 0.0), (BY_R, 0.0, 0.0, i)):
-        dtb = dx[n, row, TB]
-        _follow(dx, n, row, i, (dvo_nominal, by_xn + vsn_tb * dtb, by_xp + vsp_tb * dtb), dt, thermal, constants)
-    _diffuse(dx, n, BY_Q, dt, constants)
-    cell_step(x, n, n, i, q, r_o, dt, thermal, extended, constants)
+        dtb = dx[0, row, TB]
+        _follow(dx, row, i, (dvo_nominal, by_xn + vsn_tb * dtb, by_xp + vsp_tb * dtb), dt, thermal, constants)
+    _diffuse(dx, BY_Q, dt, constants)
+    cell_step(x, 0, 0, i, q, r_o, dt, thermal, extended, constants)
 
 
 @compiled
 def _step_rate_tangents(
-    x: FloatArray, dx: FloatArray, n: int, i: float, q: float, r_o: float, dt: float, thermal: bool, constants: FloatArray
+    x: FloatArray, dx: FloatArray, i: float, q: float, r_o: float, dt: float, thermal: bool, constants: FloatArray
 ) -> None:
-    # One step of the tangents with respect to the logarithms of RATE_CONSTANTS, in place; row n of x stays as it is
-    tb = x[n, TB]
-    xn, xp = _fractions(x, n, q, False, constants)
+    # One step of the tangents with respect to the logarithms of RATE_CONSTANTS, in place; the state stays as it is
+    tb = x[0, TB]
+    xn, xp = _fractions(x, q, False, constants)
     vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants)
     vsn, vsp = nominal_overpotentials(i, xn, xp, tb, constants)
     vsn_tb, vsp_tb = (vsn / tb, vsp / tb) if thermal else (0.0, 0.0)
     for row in range(BY_KN, dx.shape[1]):
-        dxn, dxp = _rate_fraction_tangents(dx, n, row, q, constants)
-        dtb = dx[n, row, TB]
-        _follow(dx, n, row, i, (0.0, vsn_xn * dxn + vsn_tb * dtb, vsp_xp * dxp + vsp_tb * dtb), dt, thermal, constants)
-    _diffuse(dx, n, BY_T_DIFFUSION, dt, constants)
+        dxn, dxp = _rate_fraction_tangents(dx, row, q, constants)
+        dtb = dx[0, row, TB]
+        _follow(dx, row, i, (0.0, vsn_xn * dxn + vsn_tb * dtb, vsp_xp * dxp + vsp_tb * dtb), dt, thermal, constants)
+    _diffuse(dx, BY_T_DIFFUSION, dt, constants)
     # what a constant does at a given state
     an, ap = i * constants[0, PER_CURRENT_N], i * constants[0, PER_CURRENT_P]
     scale = 2.0 * constants[0, R_OVER_F] * tb
-    dx[n, BY_KN, VSN] -= dt * scale * an / sqrt((1.0 - xn) * xn + an * an) * constants[0, TSN_RATE]
-    dx[n, BY_KP, VSP] -= dt * scale * ap / sqrt((1.0 - xp) * xp + ap * ap) * constants[0, TSP_RATE]
-    _diffuse_slower(dx, n, BY_T_DIFFUSION, x[n], dt, constants)
-    dx[n, BY_TO, VO] -= dt * (i * r_o - x[n, VO]) * constants[0, TO_RATE]
-    dx[n, BY_TSN, VSN] -= dt * (vsn - x[n, VSN]) * constants[0, TSN_RATE]
-    dx[n, BY_TSP, VSP] -= dt * (vsp - x[n, VSP]) * constants[0, TSP_RATE]
+    dx[0, BY_KN, VSN] -= dt * scale * an / sqrt((1.0 - xn) * xn + an * an) * constants[0, TSN_RATE]
+    dx[0, BY_KP, VSP] -= dt * scale * ap / sqrt((1.0 - xp) * xp + ap * ap) * constants[0, TSP_RATE]
+    _diffuse_slower(dx, BY_T_DIFFUSION, x[0], dt, constants)
+    dx[0, BY_TO, VO] -= dt * (i * r_o - x[0, VO]) * constants[0, TO_RATE]
+    dx[0, BY_TSN, VSN] -= dt * (vsn - x[0, VSN]) * constants[0, TSN_RATE]
+    dx[0, BY_TSP, VSP] -= dt * (vsp - x[0, VSP]) * constants[0, TSP_RATE]
 
 
 @compiled
@@ -328,12 +313,12 @@ def roll_out_with_tangents(
         if np.isnan(voltage_k):
             return
         voltage[k] = voltage_k
-        by_parameter[BY_Q, k], by_parameter[BY_R, k] = voltage_tangents(x, dx, 0, q, thermal, packed, derivatives)
+        by_parameter[BY_Q, k], by_parameter[BY_R, k] = voltage_tangents(x, dx, q, thermal, packed, derivatives)
         if with_rates:
             columns[1 + rows, k] = mole_fraction(x[0, QPS], q, False, constants)
-            _voltage_rate_tangents(x, dx, 0, q, thermal, packed, derivatives, by_parameter, k)
-            _step_rate_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, constants)
-        step_with_tangents(x, dx, 0, current[k], q, r_o, dt, thermal, False, constants)
+            _voltage_rate_tangents(x, dx, q, thermal, packed, derivatives, by_parameter, k)
+            _step_rate_tangents(x, dx, current[k], q, r_o, dt, thermal, constants)
+        step_with_tangents(x, dx, current[k], q, r_o, dt, thermal, False, constants)
 
 
 @compiled
@@ -357,10 +342,10 @@ def least_q_mobile(
                 # at this q the surface is empty, or full; it must stay so as tDiffusion moves its charge
                 charge_by_t = dx[0, by_t, surface] + dx[0, slope_by_t, surface] * (least - q)
                 least_by_t = charge_by_t / (full - slope) if charge > slope * q else -charge_by_t / slope
-        _diffuse(dx, 0, slope_by_t, dt, constants)
-        _diffuse_slower(dx, 0, slope_by_t, dx[0, BY_Q], dt, constants)
-        _diffuse(dx, 0, by_t, dt, constants)
-        _diffuse_slower(dx, 0, by_t, x[0], dt, constants)
-        _diffuse(dx, 0, BY_Q, dt, constants)
+        _diffuse(dx, slope_by_t, dt, constants)
+        _diffuse_slower(dx, slope_by_t, dx[0, BY_Q], dt, constants)
+        _diffuse(dx, by_t, dt, constants)
+        _diffuse_slower(dx, by_t, x[0], dt, constants)
+        _diffuse(dx, BY_Q, dt, constants)
         cell_step(x, 0, 0, current[k], q, 0.0, dt, False, False, constants)
     return least, least_by_t

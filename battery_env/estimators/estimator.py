@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from battery_env.arrays import FloatArray
@@ -17,8 +15,8 @@ from battery_env.checks import check_numbers
 from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, state_of_charge, voltage
 from battery_env.electrochemistry.ends import BAND, LONGEST_S, Cells, run_down
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
-from battery_env.estimators.state_files import load_state, save_state
-from battery_env.loads import KnownLoad, Load, in_steps, known_load
+from battery_env.estimators.state_files import Saved
+from battery_env.loads import KnownLoad, Load, known_load
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
@@ -91,7 +89,7 @@ class ModelNow(NamedTuple):
         return _cells_at(points)
 
 
-class OnlineEstimator(Estimator):
+class OnlineEstimator(Saved, Estimator):
     """
     A calibrator that runs along with a discharge: one estimate a sample, from what was measured until then.
 
@@ -136,18 +134,6 @@ class OnlineEstimator(Estimator):
         """
         raise NotImplementedError(f"{type(self).__name__} has no model that follows the discharge")
 
-    def _made_with(self) -> dict[str, Any]:
-        """What the estimator was made with, as JSON may hold it."""
-        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
-
-    def _arrays(self) -> dict[str, NDArray[Any]]:
-        """What it knows of the discharge, by name."""
-        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
-
-    def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Take :meth:`_arrays` for its own."""
-        raise NotImplementedError(f"{type(self).__name__} cannot be saved")
-
     @property
     def soc(self) -> float:
         """State of charge at the last sample: the share of ``q_mobile`` in the negative electrode."""
@@ -191,7 +177,7 @@ class OnlineEstimator(Estimator):
             [middle, *(middle + share[:, None] * each for share, each in zip(shares, now.deviations, strict=True))]
         )
         end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
-        ends_s = run_down(_cells_at(points), now, in_steps([given], dt_s), end_V).time_s
+        ends_s = run_down(_cells_at(points), now, [given], end_V).time_s
         if given_s < min(ends_s[0], LONGEST_S):
             raise ValueError(
                 f"load ends after {given_s:g} s, before the discharge does. Append what is to come, or "
@@ -201,26 +187,6 @@ class OnlineEstimator(Estimator):
             return Remaining(float(ends_s[0]), float("nan"))
         changes_s = [_slope(*each) for each in zip(shares, ends_s[1:].reshape(-1, 3), strict=True)]
         return Remaining(float(ends_s[0]), float(np.linalg.norm(changes_s)))
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """
-        Write what the estimator knows of the discharge to a file, from which another one with the same arguments goes on.
-
-        :param path: where to; ``.npz`` is added if it is missing. An older state there is replaced, any other file is not
-        :raises FileExistsError: if there is another file
-        """
-        return save_state(path, self._made_with(), self._arrays())
-
-    def load(self, path: str | os.PathLike[str]) -> None:
-        """
-        Go on from what :meth:`save` wrote.
-
-        :param path: the file
-        :raises FileNotFoundError: if there is no such file
-        :raises ValueError: if it is damaged, of another version, or of an estimator with other arguments; the estimator is
-            as it was then
-        """
-        self._restore(load_state(path, self._made_with()))
 
     def estimate(self, record: Record) -> Estimate:
         """The estimate at the last sample of a record; a ``ValueError`` if that cannot be used."""

@@ -14,8 +14,8 @@ from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, PATH_NAME
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, LIMIT_V, fit_cell
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.search import Prior, Search
-from battery_env.parameters import PARAMETER_NAMES, R_O
+from battery_env.estimators.search import Prior, Search, spread_over
+from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V, Record, check_record
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel
@@ -63,12 +63,12 @@ def fit_life(
         describe
     """
     lives = _lives(discharges)
-    chosen = [[life[n] for n in _spread_over(len(life), _AGES)] for life in lives]
-    several = [life[n] for life in chosen for n in _spread_over(len(life), max(_JOINT_AGES // len(lives), 2))]
+    chosen = [[life[n] for n in spread_over(len(life), _AGES)] for life in lives]
+    several = [life[n] for life in chosen for n in spread_over(len(life), max(_JOINT_AGES // len(lives), 2))]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=UserWarning)  # its doubts are of one set of constants for all ages
         common = fit_cell(several, cut_off_V, start, thermal=False, limit_V=2.0 * limit_V).cell
-    reference = LeastSquares(cell=start, r_o_bounds_ohm=R_O.limits)
+    reference = LeastSquares(cell=start)
     model, errors_V, fitted = RecordModel(common), [], []
     for life in chosen:
         ages = []
@@ -96,10 +96,6 @@ def _lives(discharges: Sequence[Record] | Sequence[Sequence[Record]]) -> list[li
     if any(len(life) < 2 for life in lives):
         raise ValueError(f"a life is of at least two discharges, got {[len(life) for life in lives]}")
     return lives
-
-
-def _spread_over(length: int, count: int) -> list[int]:
-    return np.unique(np.linspace(0, length - 1, min(count, length)).round().astype(np.int64)).tolist()
 
 
 def _fit_age(record: Record, model: RecordModel, reference: LeastSquares, cut_off_V: float) -> tuple[tuple[float, ...], float]:

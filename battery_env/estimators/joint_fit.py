@@ -29,7 +29,7 @@ from battery_env.estimators.cell_fit import (
 )
 from battery_env.estimators.diagnosis.conditions import ABOVE_REST_V, BELOW_REST_V
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, square
+from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, spread_over, square
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records import (
     CUT_OFF_V,
@@ -235,9 +235,7 @@ class JointFit:
     def _alone(self, cell: CellParameters, d: int) -> tuple[Estimate, float]:
         """With some constants, what fits best to one discharge, and the error left (root mean square), V."""
         model, data = self.model.of_cell(cell), self.data[d]
-        estimate = LeastSquares(
-            cell=cell, thermal=model.thermal, dt_s=model.dt_s, q_mobile_bounds_C=Q_MOBILE.limits, r_o_bounds_ohm=R_O.limits
-        ).estimate(self.records[d])
+        estimate = LeastSquares(cell=cell, thermal=model.thermal, dt_s=model.dt_s).estimate(self.records[d])
         (voltage_V,) = data.at_samples([model.tangents(data.current_A, estimate.q_mobile, estimate.r_o).voltage_V])
         return estimate, _rms(voltage_V - data.voltage_V)
 
@@ -406,8 +404,7 @@ class JointFit:
 
 
 def _thinned(data: OnGrid) -> OnGrid:
-    samples = len(data.time_s)
-    kept = np.unique(np.linspace(0, samples - 1, min(samples, _MOST_SAMPLES)).round().astype(np.int64))
+    kept = spread_over(len(data.time_s), _MOST_SAMPLES)
     return replace(data, time_s=data.time_s[kept], voltage_V=data.voltage_V[kept])
 
 

@@ -264,7 +264,8 @@ class LeastSquares(Estimator):
         noise_V = self.voltage_noise_V
         if noise_V is None and self.nuisance:  # their priors are weighed against the white part of the residuals
             noise_V = max(white_noise_V(search.residual(dict.fromkeys(self.nuisance, 0.0) | starts[0])[0]), _LEAST_NOISE_V)
-        errors = self._independent_errors(record)
+        # so many independent errors of the model a record holds: along a path more than one, as they drift
+        errors = 1.0 if self.path is None else 1.0 + self.path.errors_per_C * drawn_charge_C(record)
         mismatch_V = sqrt(n / errors) * self.mismatch_V
         weight_V = hypot(noise_V or 0.0, mismatch_V)
         priors: list[Prior | JointPrior] = [Prior(name, 0.0, weight_V / sd) for name, sd in self.nuisance.items()]
@@ -294,12 +295,6 @@ class LeastSquares(Estimator):
         model_V[: len(fit.residual_V)] = record.voltage_V[: len(fit.residual_V)] + fit.residual_V
         estimate = [fit.values[name] for name in PARAMETER_NAMES]
         return watched(record, self.model.cell, self.initial_soc[0] if self._at_rest else None, estimate, shown, model_V)
-
-    def _independent_errors(self, record: Samples) -> float:
-        """How many independent errors of the model a record holds: along a path more than one, as they drift."""
-        if self.path is None:
-            return 1.0
-        return 1.0 + self.path.errors_per_C * drawn_charge_C(record)
 
     def _hidden_sd(self, search: Search, fit: Fit, unseen_C: float) -> dict[str, float]:
         """

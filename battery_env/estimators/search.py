@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from battery_env.arrays import BoolArray, FloatArray
+from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, EQUILIBRIUM_SIZE
 from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE, CellParameters
 from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
@@ -348,6 +348,11 @@ class Search:
 def _diffusion_rate(cell: CellParameters) -> float:
     """At which the charges of bulk and surface come together, 1/s."""
     return float(cell.packed.constants[0, [BULK_RATE, SURFACE_RATE]].sum())
+
+
+def spread_over(length: int, count: int) -> IntArray:
+    """At most so many places of a sequence, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, length - 1, min(count, length)).round().astype(np.int64))
 
 
 def square(array: FloatArray) -> float:

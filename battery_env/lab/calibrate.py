@@ -30,7 +30,7 @@ from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
-from battery_env.loads import Load, LoadToCome, constant, in_steps
+from battery_env.loads import Load, LoadToCome, constant
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A, shown_beside
 from battery_env.records.discharge import Discharge
@@ -378,7 +378,7 @@ def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
     if not load_A > 0.0 or not settings.tells_new_capacity(load_A):
         return float("nan")
     # the cell is empty by then
-    return float(model.capacity_Ah(in_steps([constant(load_A, "current")], model.dt_s), settings.cut_off_V)[0])
+    return float(model.capacity_Ah([constant(load_A, "current")], settings.cut_off_V)[0])
 
 
 def _end_temperatures(record: Discharge, forecast: VoltageForecast) -> tuple[float, float]:

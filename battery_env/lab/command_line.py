@@ -26,11 +26,10 @@ from pathlib import Path
 from threading import Timer
 from typing import Any, Literal, ParamSpec
 
-import numpy as np
-
 from battery_env.estimators.cell_fit import CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.estimators.joint_fit import fit_cell
+from battery_env.estimators.search import spread_over
 from battery_env.files import check_new, finite_or_none
 from battery_env.lab.many import calibrate_all
 from battery_env.lab.readers.columns import FileFormat
@@ -248,33 +247,27 @@ examples:
 
 
 def _parser(name: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=name,
+    parser = _reading(
+        name,
         usage=f"{name} FILE [FILE ...] [options]",
         description=_FIRST.format("\n".join(f"  {_INSTALLED} {other:<10}{what}" for other, (_, what) in _OTHERS.items())),
         epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
-    _add_files(parser)
     _add(parser.add_argument_group("calibration"), _CALIBRATION, default=argparse.SUPPRESS)
     _add(parser.add_argument_group("results"), _RESULTS)
     return parser
 
 
 def _fit_parser(name: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=name,
-        description=(
-            "Fit the constants of the model to a few discharges of one cell, each from full charge to the cut-off, and save "
-            "them for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for."
-        ),
+    parser = _reading(
+        name,
+        description="Fit the constants of the model to a few discharges of one cell, each from full charge to the cut-off, "
+        "and save them for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for.",
         epilog="Exit status: 0, 3 if the discharges may not have started full, are of one age or not of one cell, or 2 if one "
         "cannot be used or does not reach the cut-off, or the equations do not describe the cell.",
-        allow_abbrev=False,
     )
-    _add_files(parser)
     group = parser.add_argument_group("fit")
     group.add_argument(
         "--cut-off", type=float, default=CUT_OFF_V, metavar="V", help="where the discharge ends, V (default: %(default)s)"
@@ -291,16 +284,13 @@ def _fit_parser(name: str) -> argparse.ArgumentParser:
 
 
 def _forecast_parser(name: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=name,
-        description=(
-            "Forecast the end of a discharge in progress, with an interval that holds nine of ten ends, from the life of its "
-            "cell and the load to come."
-        ),
+    parser = _reading(
+        name,
+        many=False,
+        description="Forecast the end of a discharge in progress, with an interval that holds nine of ten ends, from the life "
+        "of its cell and the load to come.",
         epilog="Exit status: 0, 3 if something in the record contradicts the estimate, or 2 if something cannot be used.",
-        allow_abbrev=False,
     )
-    _add_files(parser, many=False)
     group = parser.add_argument_group("forecast")
     group.add_argument(
         "--life",
@@ -331,7 +321,9 @@ def _add(group: Any, options: _Options, **common: Any) -> None:
         group.add_argument(*flags, **common, **how)
 
 
-def _add_files(parser: argparse.ArgumentParser, many: bool = True) -> None:
+def _reading(name: str, many: bool = True, **told: Any) -> argparse.ArgumentParser:
+    """The parser of a command that reads files."""
+    parser = argparse.ArgumentParser(prog=name, allow_abbrev=False, **told)
     parser.add_argument(
         "records" if many else "record",
         nargs="+" if many else None,
@@ -342,6 +334,7 @@ def _add_files(parser: argparse.ArgumentParser, many: bool = True) -> None:
     group = parser.add_argument_group("reading")
     _add(group, _FILES)
     _add(group.add_mutually_exclusive_group(), _SIGN, action="store_const", dest="discharge_is_negative")
+    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -404,7 +397,7 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) ->
     if settings.policy is not None:
         made_with["policy"] = sha256(settings.policy.read_bytes()).hexdigest()
     results = Results(options.out, sources, not options.table_only, settings, made_with)
-    with results.opened(sources, options.force):
+    with results.opened(options.force):
         return _calibrate(sources, settings, file_format, options, results)
 
 
@@ -489,8 +482,8 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
 
     from battery_env.plotting import plot_cell_fit, save_figure  # here, as matplotlib takes long to import
 
-    shown = np.unique(np.linspace(0, len(discharges) - 1, _MOST_SHOWN).round().astype(np.int64))
-    save_figure(plot_cell_fit(found, [discharges[n] for n in shown]), picture)
+    shown = [discharges[n] for n in spread_over(len(discharges), _MOST_SHOWN)]
+    save_figure(plot_cell_fit(found, shown), picture)
     print(f"\nwritten: {out}, {picture}")
     return NOT_SETTLED if found.doubt else SETTLED
 

@@ -9,7 +9,7 @@ import numpy as np
 from battery_env.checks import LoadUnit, check_load, check_positive
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
-from battery_env.loads import constant, in_steps
+from battery_env.loads import constant
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records import CUT_OFF_V
 from battery_env.records.model import RecordModel
@@ -68,8 +68,7 @@ def capacity_Ah(
 
     step_C = _STEP_SHARE * q_C
     q_mobile, r_o = q_C + step_C * np.array([0.0, -1.0, 1.0, 0.0]), r_ohm + np.array([0.0, 0.0, 0.0, _STEP_OHM])
-    loads = in_steps([constant(float(load), load_unit)], model.dt_s)
-    value, less, more, of_r = model.capacity_Ah(loads, cut_off, q_mobile, r_o).tolist()
+    value, less, more, of_r = model.capacity_Ah([constant(float(load), load_unit)], cut_off, q_mobile, r_o).tolist()
     by_q, by_r = (more - less) / (2.0 * step_C), (of_r - value) / _STEP_OHM
     return Derived(value, _sd(estimate, by_q, by_r))
 

@@ -16,17 +16,7 @@ from battery_env.electrochemistry.ends import BAND, Cells, Ends, follow, quantil
 from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.conditions import white_noise_V
 from battery_env.estimators.estimator import ModelNow
-from battery_env.loads import (
-    BlockBootstrap,
-    Cycle,
-    KnownLoad,
-    Load,
-    LoadToCome,
-    RandomLoad,
-    in_steps,
-    known_load,
-    steadier_unit,
-)
+from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, LoadToCome, RandomLoad, known_load, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records import CUT_OFF_V, Record, Samples, check_record, expected_current
 from battery_env.records.model import RECENT_SHARE, RecordModel
@@ -240,10 +230,10 @@ def forecast(
         now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
     else:
         now_s = float(seen.time_s[-1])
-        ends = run_down(cells, model, in_steps(draws[-samples:], model.dt_s), cut_off, _COURSE_S)
+        ends = run_down(cells, model, draws[-samples:], cut_off, _COURSE_S)
     if nominal_Ah is None:
         # the mean over loads: under a single draw, health would be a matter of that draw. No charge takes a cell to its end
-        given_Ah = model.capacity_Ah(in_steps(draws[:_NOMINAL_DRAWS], model.dt_s), cut_off)
+        given_Ah = model.capacity_Ah(draws[:_NOMINAL_DRAWS], cut_off)
         nominal_Ah = float(given_Ah[given_Ah > 0.0].mean()) if (given_Ah > 0.0).any() else float("nan")
     return Forecast(
         record=seen,

@@ -30,17 +30,7 @@ from battery_env.records.discharge import Discharge
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
-_COLUMNS = (
-    "q_mobile_C",
-    "sd_q_mobile_C",
-    "r_o_ohm",
-    "settled",
-    "reason",
-    "valid",
-    "capacity_Ah",
-    "mean_current_A",
-    "lasted_share",
-)
+_COLUMNS = "cycle q_mobile_C sd_q_mobile_C r_o_ohm settled reason valid capacity_Ah mean_current_A lasted_share".split()
 # Lives that are simulated, and discharges to look ahead.
 _LIVES, _MOST = 2000, 2000
 
@@ -197,7 +187,7 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
             rows.append(row | _told(discharge, cut_off_V, calibrator))
         except ValueError as error:  # of one that cannot be used
             rows.append(row | {"settled": False, "valid": False, "reason": str(error)})
-    return life_of(pd.DataFrame(rows, columns=["cycle", *_COLUMNS]))
+    return life_of(pd.DataFrame(rows, columns=_COLUMNS))
 
 
 def _told(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> dict[str, Any]:

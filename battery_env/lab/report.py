@@ -155,9 +155,7 @@ def text_of(name: str, found: Calibration) -> str:
     if not found.settled:
         lines += ["", f"{_HOW['reason']['text']}: {found.reason}"]
         if found.in_progress and not found.settled_q_mobile and found.settings.prior_q_mobile_C is None:
-            lines += [
-                "Or give the earlier discharges of this cell: battery-calibrate forecast FILE --life FOLDER",
-            ]
+            lines.append("Or give the earlier discharges of this cell: battery-calibrate forecast FILE --life FOLDER")
     return "\n".join(lines)
 
 

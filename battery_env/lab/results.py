@@ -82,7 +82,8 @@ class Results:
         made_with: Mapping[str, Any],
     ) -> None:
         self.folder, self.with_voltages, self._settings = folder, with_voltages, settings
-        prefix = f"{record_name(sources[0].stem, sources[0].cycle)}_" if len(sources) == 1 else ""
+        self._stems = [record_name(source.stem, source.cycle) for source in sources]
+        prefix = f"{self._stems[0]}_" if len(sources) == 1 else ""
         self.table, self.parquet = (folder / f"{prefix}{name}" for name in TABLES)
         self.life, self.run = folder / f"{prefix}{LIFE}", folder / f"{prefix}{RUN}"
         self._sources = {source.argument: number for number, source in enumerate(sources)}
@@ -93,13 +94,13 @@ class Results:
         check_folder(folder)
 
     @contextmanager
-    def opened(self, sources: Sequence[Source], replace: bool) -> Iterator[Results]:
+    def opened(self, replace: bool) -> Iterator[Results]:
         """Hold the files against other commands, read what of the run is done, and refuse what may not be replaced."""
         with locked(self.run):
             if replace:
                 self.run.unlink(missing_ok=True)
             lines = self._lines()
-            if lines is None and not replace and (existing := self._existing(sources)):
+            if lines is None and not replace and (existing := self._existing()):
                 more = f" and {len(existing) - 3} more" if len(existing) > 3 else ""
                 shown = ", ".join(str(path) for path in existing[:3])
                 raise FileExistsError(f"{shown}{more} would be replaced; choose another --out, or give --force")
@@ -132,11 +133,11 @@ class Results:
                 kept.append(line)
         return kept
 
-    def _existing(self, sources: Sequence[Source]) -> list[Path]:
+    def _existing(self) -> list[Path]:
         if not self.folder.is_dir():
             return []
         # the numbers of the discharges are not known before their files are read
-        stems = "|".join(re.escape(record_name(source.stem, source.cycle)) for source in sources)
+        stems = "|".join(map(re.escape, self._stems))
         voltages = re.compile(rf"(?:{stems})(?:_\d+)*{VOLTAGE}\.(?:csv|png)", flags=re.IGNORECASE)
         tables = {path.name for path in (self.table, self.parquet, self.life)}
         return [

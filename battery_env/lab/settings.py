@@ -192,7 +192,6 @@ class Settings:
             return self._policy()
         calibrator = ExtendedKalmanFilter if self.method == "kalman" else partial(LeastSquares, path=self.path)
         stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
-        bounds: dict[str, Any] = {} if self.q_mobile_bounds_C is None else {"q_mobile_bounds_C": self.q_mobile_bounds_C}
         return calibrator(
             self.parameters,
             cell or self.cell or NEW_CELL,
@@ -202,7 +201,7 @@ class Settings:
             current_gain_sd=self.current_gain_sd,
             cell_sd_r_o_ohm=self.cell_sd_r_o_ohm,
             initial_soc=stated if start is None else (start.soc, start.sd_soc),
-            **bounds,
+            q_mobile_bounds_C=Q_MOBILE.limits if self.q_mobile_bounds_C is None else self.q_mobile_bounds_C,
         )
 
     def _policy(self) -> PolicyEstimator:

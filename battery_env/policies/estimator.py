@@ -23,15 +23,7 @@ from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, 
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
 from battery_env.policies.readings import columns, on_grid, with_voltage
-from battery_env.records import (
-    Samples,
-    Shown,
-    check_drawn_charge,
-    check_record,
-    check_sample,
-    drawn_charge_C,
-    shown_beside,
-)
+from battery_env.records import Samples, Shown, check_drawn_charge, check_record, check_sample, drawn_charge_C, shown_beside
 from battery_env.records.model import RecordModel
 from battery_env.tasks.env import CalibrationEnv, task_class
 from battery_env.tasks.task import CalibrationTask
@@ -207,9 +199,8 @@ class PolicyEstimator(OnlineEstimator):
         # two beside the first one
         if due > self._decisions and len(with_voltage(self._samples, due * self.decision_s).time_s) > 2:
             self._decide(due)
-        (q_mobile, r_o), (sd_q_mobile, sd_r_o), (settled_q, settled_r_o, reason) = self._now.tolist(), self._sd, self._verdict
-        both = settled_q and settled_r_o
-        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, both, reason, settled_q, settled_r_o, self._found)
+        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = self._now.tolist(), self._sd
+        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **self._verdict._asdict(), constants=self._found)
 
     def _follow(self, records: Sequence[Record], decision_s: float) -> CalibrationTask:
         # a data set may know its own constants, of which the policy must not learn

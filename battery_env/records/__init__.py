@@ -2,10 +2,7 @@
 
 from battery_env.records.samples import CUT_OFF_V as CUT_OFF_V
 from battery_env.records.samples import LEAST_LOAD_SHARE as LEAST_LOAD_SHARE
-from battery_env.records.samples import MILLIAMPERE as MILLIAMPERE
 from battery_env.records.samples import REST_CURRENT_A as REST_CURRENT_A
-from battery_env.records.samples import REST_LIMIT_S as REST_LIMIT_S
-from battery_env.records.samples import SAMPLE_INTERVAL_LIMITS_S as SAMPLE_INTERVAL_LIMITS_S
 from battery_env.records.samples import SWITCH_SHARE as SWITCH_SHARE
 from battery_env.records.samples import VARIED_SHARE as VARIED_SHARE
 from battery_env.records.samples import ExpectedCurrent as ExpectedCurrent
@@ -13,18 +10,14 @@ from battery_env.records.samples import Record as Record
 from battery_env.records.samples import Samples as Samples
 from battery_env.records.samples import Stream as Stream
 from battery_env.records.samples import are_plausible as are_plausible
-from battery_env.records.samples import check_column as check_column
 from battery_env.records.samples import check_drawn_charge as check_drawn_charge
 from battery_env.records.samples import check_record as check_record
 from battery_env.records.samples import check_sample as check_sample
-from battery_env.records.samples import check_samples as check_samples
 from battery_env.records.samples import drawn as drawn
 from battery_env.records.samples import drawn_charge_C as drawn_charge_C
 from battery_env.records.samples import expected_current as expected_current
-from battery_env.records.samples import least_load_A as least_load_A
 from battery_env.records.samples import mean_current_A as mean_current_A
 from battery_env.records.samples import resample_current as resample_current
-from battery_env.records.samples import switch_times_s as switch_times_s
 from battery_env.records.shown import ChargeBefore as ChargeBefore
 from battery_env.records.shown import Shown as Shown
 from battery_env.records.shown import shown_beside as shown_beside

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,13 +25,8 @@ from battery_env.electrochemistry import (
     rest_shares,
     simulate,
 )
-from battery_env.electrochemistry.ends import LONGEST_S, Cells, Loads, run_down
-from battery_env.electrochemistry.tangents import (
-    TANGENT_NAMES,
-    PolynomialDerivatives,
-    least_q_mobile,
-    roll_out_with_tangents,
-)
+from battery_env.electrochemistry.ends import LONGEST_S, Cells, ToCome, run_down
+from battery_env.electrochemistry.tangents import TANGENT_NAMES, PolynomialDerivatives, least_q_mobile, roll_out_with_tangents
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records.samples import Record, check_record, expected_current, resample_current
@@ -252,12 +248,12 @@ class RecordModel:
         )
 
     def capacity_Ah(
-        self, loads: Loads, cut_off_V: float, q_mobile: ArrayLike | None = None, r_o: ArrayLike | None = None
+        self, loads: Sequence[ToCome], cut_off_V: float, q_mobile: ArrayLike | None = None, r_o: ArrayLike | None = None
     ) -> FloatArray:
         """
         The charge that cells give from full down to the cut-off; what a load charges first comes on top.
 
-        :param loads: of :func:`battery_env.loads.in_steps`, one for all or one a cell
+        :param loads: of :mod:`battery_env.loads`, in one unit, one for all or one a cell
         :param cut_off_V: cut-off voltage, V
         :param q_mobile: charge that can move, C, shape (n,); ``None``: that of ``cell``
         :param r_o: ohmic resistance, ohm, shape (n,); likewise
@@ -265,7 +261,7 @@ class RecordModel:
         """
         q_C = Q_MOBILE.check(self.cell.q_mobile if q_mobile is None else q_mobile)
         r_ohm = R_O.check(self.cell.r_o if r_o is None else r_o)
-        q_C, r_ohm, _ = (np.array(each) for each in np.broadcast_arrays(q_C, r_ohm, loads.until_s))
+        q_C, r_ohm, _ = (np.array(each) for each in np.broadcast_arrays(q_C, r_ohm, np.empty(len(loads))))
         as_model = np.zeros(len(q_C))
         full = Cells(q_C, r_ohm, initial_state(q_C, self.cell), as_model, as_model)
         return run_down(full, self, loads, cut_off_V, surplus_share=np.inf).capacity_Ah

@@ -41,12 +41,7 @@ _KELVIN = "Give the temperature in degrees Celsius, not in kelvin (command line:
 # name: least and largest plausible value, unit, what a value beyond usually is
 _PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
     "voltage_V": (-0.1, 5.5, "V", _MILLIVOLT),  # half cells are driven a little below 0
-    "current_A": (
-        -LOAD_LIMITS["current"],
-        LOAD_LIMITS["current"],
-        "A",
-        MILLIAMPERE,
-    ),
+    "current_A": (-LOAD_LIMITS["current"], LOAD_LIMITS["current"], "A", MILLIAMPERE),
     "temperature_C": (-60.0, 150.0, "degC", _KELVIN),
 }
 

@@ -87,32 +87,17 @@ def _splits(
     cell: CellParameters,
     path: AgingPath | None,
 ) -> dict[Split, TrajectoryDataset]:
-    if path is None:
-        whole = _whole(parameters, load, dt_s, mismatch, cell)
-    else:
+    if path is not None:
         whole = TrajectoryDataset.along(path, DISCHARGES, _loads(load, dt_s), SEED, dt_s)
+    elif load == "paper" and len(parameters) == 1 and dt_s == 1.0 and mismatch == 0.0 and cell == NEW_CELL:
+        whole = TrajectoryDataset.paper(parameters[0])
+    else:
+        ranges = PAPER_RANGES if load == "paper" else {"q_mobile": Q_MOBILE_RANGE_C, "r_o": R_O_RANGE_OHM}
+        asked = (parameters, DISCHARGES, _loads(load, dt_s), SEED, ranges["q_mobile"], ranges["r_o"])
+        whole = TrajectoryDataset.generate(*asked, dt_s, cell=cell, mismatch=mismatch)
+        whole = whole.trimmed(*PAPER_TRIM) if load == "paper" else whole
     train, test = whole.split(test=TEST_SHARE, seed=SEED)
     return {"train": train, "test": test, "all": whole}
-
-
-def _whole(
-    parameters: tuple[str, ...], load: LoadKind, dt_s: float, mismatch: float, cell: CellParameters
-) -> TrajectoryDataset:
-    if load == "paper" and len(parameters) == 1 and dt_s == 1.0 and mismatch == 0.0 and cell == NEW_CELL:
-        return TrajectoryDataset.paper(parameters[0])
-    ranges = PAPER_RANGES if load == "paper" else {"q_mobile": Q_MOBILE_RANGE_C, "r_o": R_O_RANGE_OHM}
-    whole = TrajectoryDataset.generate(
-        parameters,
-        DISCHARGES,
-        _loads(load, dt_s),
-        SEED,
-        q_mobile_range=ranges["q_mobile"],
-        r_o_range=ranges["r_o"],
-        dt_s=dt_s,
-        cell=cell,
-        mismatch=mismatch,
-    )
-    return whole.trimmed(*PAPER_TRIM) if load == "paper" else whole
 
 
 def _loads(load: LoadKind, dt_s: float) -> list[Load] | LoadSampler:

@@ -133,5 +133,4 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             return None
         from battery_env.tasks.rendering import draw_frame  # matplotlib only for those who look
 
-        task = self.task
-        return draw_frame(list(self._history), task.parameters, task.episode_steps, task.decision_s)
+        return draw_frame(self._history, self.task)

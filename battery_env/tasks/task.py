@@ -17,6 +17,9 @@ from battery_env.trajectories import IntArray
 if TYPE_CHECKING:
     from battery_env.tasks.voltage.fit import Fitted
 
+# Which cells of a batch, and a source of randomness for each of them.
+Rows = NDArray[np.intp]
+Generators = Sequence[np.random.Generator]
 #: Observations are clipped here; what a calibrated model shows is of order 1.
 OBSERVATION_LIMIT = 100.0
 
@@ -87,12 +90,7 @@ class CalibrationTask(ABC):
             raise ValueError(f"dataset stands in place of {', '.join(others)}: give one or the other")
 
     @abstractmethod
-    def start(
-        self,
-        rows: NDArray[np.intp],
-        generators: Sequence[np.random.Generator],
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
+    def start(self, rows: Rows, generators: Generators, options: Mapping[str, Any] | None = None) -> None:
         """
         Begin a new episode for some cells.
 

@@ -133,8 +133,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
             return None
         from battery_env.tasks.rendering import draw_frame  # matplotlib only for those who look
 
-        task = self.task
-        return tuple(draw_frame(list(h), task.parameters, task.episode_steps, task.decision_s) for h in self._histories)
+        return tuple(draw_frame(history, self.task) for history in self._histories)
 
     def _checked_mask(self, mask: Any) -> Mask:
         if not (isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,) and mask.any()):

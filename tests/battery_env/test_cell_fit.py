@@ -29,7 +29,6 @@ from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.loads import constant as constant_load
-from battery_env.loads import in_steps
 from battery_env.policies.pretrained import pretrained_card
 from battery_env.records.discharge import Discharge
 
@@ -247,7 +246,7 @@ class TestRealCells:
         low_s, median_s, high_s = found.eod_quantile_s()
         assert low_s < end_s < high_s and abs(median_s - end_s) < 0.5 * abs(new.eod_quantile_s(0.5) - end_s)
         assert 1.7 < found.nominal_Ah < 1.95  # the first discharge that was fitted gave 1.86 Ah
-        loads = in_steps([constant_load(record.current_A[-1], "current")], 1.0)
+        loads = [constant_load(record.current_A[-1], "current")]
         assert found.nominal_Ah == pytest.approx(calibrator.model.capacity_Ah(loads, 2.7)[0])
 
     def test_a_fit_says_what_it_is_of(self, b0005_fit):

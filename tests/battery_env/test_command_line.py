@@ -22,7 +22,7 @@ from battery_env.lab.calibrate import calibrate as calibrated
 from battery_env.lab.command_line import main
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Settings
-from battery_env.loads import constant, in_steps
+from battery_env.loads import constant
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 
@@ -102,7 +102,7 @@ def test_a_file_of_constants_takes_the_place_of_the_new_cell(recorded, tmp_path,
     fit = LeastSquares(cell=CellParameters.from_json(cell), thermal=True, mismatch_V=0.05, current_gain_sd=0.005)
     record = recorded.loaded_part(2.7)
     drawn_Ah = record.charge_C / 3600.0
-    (given_Ah,) = fit.model.capacity_Ah(in_steps([constant(record.current_A[-1], "current")], 1.0), 2.7)
+    (given_Ah,) = fit.model.capacity_Ah([constant(record.current_A[-1], "current")], 2.7)
     assert f"{fit.estimate(record).q_mobile / 3600.0:.3f} Ah" in shown
     drawn = f"{drawn_Ah:.3f} Ah (sd {0.005 * drawn_Ah:.3f} Ah), drawn"
     health = f"{drawn_Ah / given_Ah:.3f}   {drawn}, of {given_Ah:.4g} Ah, what the given cell yields"

@@ -11,7 +11,7 @@ from battery_env import LeastSquares, fit_cell, load_nasa_discharges, soc_from_r
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.lab.command_line import NOT_SETTLED, SETTLED, calibrate
 from battery_env.lab.life import track_life
-from battery_env.loads import constant, in_steps
+from battery_env.loads import constant
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel
 
@@ -110,7 +110,7 @@ class TestCommandLine:
         assert status == SETTLED and row["initial_soc"] == 0.8 and row["q_mobile_C"] == pytest.approx(6000.0, rel=0.02)
         # the capacity is that of a full cell
         full = RecordModel(NEW_CELL.replace(q_mobile=6000.0, r_o=0.15), thermal=True)
-        (full,) = full.capacity_Ah(in_steps([constant(2.0, "current")], 1.0), 2.8)
+        (full,) = full.capacity_Ah([constant(2.0, "current")], 2.8)
         assert row["capacity_Ah"] is None and row["predicted_capacity_Ah"] == pytest.approx(full, rel=0.03)
         assert row["state_of_health"] == pytest.approx(full / 2.0, rel=0.03)
         status, row = self.row(record, tmp_path, capsys, *options)

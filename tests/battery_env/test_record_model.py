@@ -8,7 +8,7 @@ import pytest
 from battery_env.electrochemistry import NEW_CELL, QNS, QPS, initial_state, simulate
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.estimates import Estimate
-from battery_env.loads import constant, in_steps
+from battery_env.loads import constant
 from battery_env.records.model import RecordModel
 
 CURRENT_A = np.repeat(np.random.default_rng(0).uniform(0.5, 2.5, 40), 75)
@@ -151,7 +151,7 @@ class TestForecast:
         for current_A in (1e-9, 1e-3):  # steps down to the cut-off would not fit in memory, or take minutes
             forecast = RecordModel().forecast(RECORD.part(0, 900), TRUTH, future_current_A=current_A)
             assert np.isnan(forecast.eod_time_s) and len(forecast.time_s) == 900
-            assert np.isnan(RecordModel().capacity_Ah(in_steps([constant(current_A, "current")], 1.0), 3.0)).all()
+            assert np.isnan(RecordModel().capacity_Ah([constant(current_A, "current")], 3.0)).all()
 
     def test_it_follows_a_slow_discharge_for_days(self):
         eod_time_s = RecordModel(dt_s=2.0).forecast(RECORD.part(0, 900), TRUTH, future_current_A=0.02).eod_time_s

@@ -371,18 +371,6 @@ def belongs(seen: Row) -> bool:
 
 
 @compiled
-def _lagging_current_A(before_A: float, current_A: float, duration_s: float) -> float:
-    # what the ohmic drop stands for after a while; it follows slowly
-    return before_A + (before_A - current_A) * expm1(-duration_s / _FOLLOWS_S)
-
-
-@compiled
-def _change_to_follow_A(switched_A: float, current_A: float, lagging_A: float) -> float:
-    # how much of a current step the ohmic drop must follow: little after a pulse too short for it to build up
-    return max(min(current_A - lagging_A, max(switched_A, 0.0)), min(switched_A, 0.0))
-
-
-@compiled
 def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, resistance_ohm: float) -> bool:
     # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then, or that
     # drop is no more than noise
@@ -431,8 +419,10 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
         switch.size_A += switched_A
         if _take_back(seen, current, most_q, r_o):
             return
-        switch.to_follow_A = _change_to_follow_A(switch.size_A, current, last.lagging_A)
-    last.lagging_A = _lagging_current_A(last.lagging_A, last.current_A, time_s - last.time_s)
+        # the ohmic drop must follow little after a pulse too short for it to build up
+        switch.to_follow_A = max(min(current - last.lagging_A, max(switch.size_A, 0.0)), min(switch.size_A, 0.0))
+    # the ohmic drop follows slowly
+    last.lagging_A += (last.lagging_A - last.current_A) * expm1(-(time_s - last.time_s) / _FOLLOWS_S)
 
 
 @compiled

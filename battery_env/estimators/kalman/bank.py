@@ -138,7 +138,7 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
     q, r_o, p = one.mean[Q], one.mean[R], one.covariance
     steps = int(np.ceil(duration / settings.dt_s - 1e-6))
     for _ in range(steps):
-        step_with_tangents(one.state, one.tangents, 0, current, q, r_o, duration / steps, settings.thermal, True, constants)
+        step_with_tangents(one.state, one.tangents, current, q, r_o, duration / steps, settings.thermal, True, constants)
     p[Q, Q] += settings.growth[Q] * duration
     p[R, R] += settings.growth[R] * duration
     p[OFFSET, OFFSET] += settings.offset_growth * duration
@@ -209,10 +209,10 @@ def _correct(
     # One measurement, to second order in q_mobile; charge: what flowed since the last one
     state, tangents, mean, p = one.state, one.tangents, one.mean, one.covariance
     q, r_o = mean[Q], mean[R]
-    by_q, by_r = voltage_tangents(state, tangents, 0, q, settings.thermal, packed, derivatives)
+    by_q, by_r = voltage_tangents(state, tangents, q, settings.thermal, packed, derivatives)
     h = (by_q, by_r, 1.0)
     # over the spread of q_mobile a curved voltage is higher by this in the mean, with twice its square as the variance
-    bend = 0.5 * voltage_curvature(state, tangents, 0, q, packed, derivatives) * p[Q, Q]
+    bend = 0.5 * voltage_curvature(state, tangents, q, packed, derivatives) * p[Q, Q]
     ph = (
         p[0, 0] * h[0] + p[0, 1] * h[1] + p[0, 2] * h[2],
         p[1, 0] * h[0] + p[1, 1] * h[1] + p[1, 2] * h[2],

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from math import inf, isnan, nan
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +23,7 @@ from battery_env.estimators.diagnosis.samples import begin, belongs, examine, ex
 from battery_env.estimators.estimator import ModelNow, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
-from battery_env.estimators.state_files import load_state, save_state
+from battery_env.estimators.state_files import Saved
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import ChargeBefore, Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
 
@@ -325,11 +323,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
     def _arrays(self) -> dict[str, NDArray[Any]]:
         return {"cells": self._cells, "filters": self._filters}
 
-    def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
 
-
-class KalmanBatch:
+class KalmanBatch(Saved):
     """
     Cells side by side, each followed by a filter of its own with the same arguments: rows of the same tables, which take their
     samples in one compiled call.
@@ -390,15 +385,6 @@ class KalmanBatch:
 
         settled_q_mobile, settled_r_o = (said["condition"] == Condition.SETTLED).T
         return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled_q_mobile, settled_r_o, reason_of)
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write what is known of all cells, as :meth:`ExtendedKalmanFilter.save`."""
-        return save_state(path, self._made_with(), self._arrays())
-
-    def load(self, path: str | os.PathLike[str]) -> None:
-        """Go on from what :meth:`save` wrote."""
-        arrays = load_state(path, self._made_with())
-        self._cells[...], self._filters[...] = arrays["cells"], arrays["filters"]
 
     def _made_with(self) -> dict[str, Any]:
         return {"cells": len(self.estimators), **self.estimators[0]._made_with()}

@@ -135,16 +135,13 @@ class FileFormat:
     ignore: Collection[str] = ()
 
 
-def find_columns(
-    names: Sequence[str], file_format: FileFormat | None = None, rows: Iterable[Sequence[str]] = ()
-) -> dict[str, Column]:
+def find_columns(names: Sequence[str], file_format: FileFormat, rows: Iterable[Sequence[str]]) -> dict[str, Column]:
     """
     The columns of a record by quantity, from the names of all columns and the first rows, whose words may say which are
     charges. Columns that may serve as well have the quantity and a number, as ``time 2``. A unit is told from the name, as in
     ``Current(mA)``, ``Voltage / V``, ``mAmps`` or ``test_time_second``; a name without one is in s, V, A or degC. A unit of
     another quantity rules a column out.
     """
-    file_format = file_format or FileFormat()
     chosen, units, ignore = file_format.columns or {}, file_format.units or {}, [name.strip() for name in file_format.ignore]
     for option, given in (("columns", chosen), ("units", units)):
         if unknown := set(given) - set(_NAMES):

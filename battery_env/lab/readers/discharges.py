@@ -76,10 +76,8 @@ class Recording(NamedTuple):
         unit = _UNIT_ADVICE.search(sentence)
         if not unit and _SIGN_ADVICE not in sentence:
             return sentence
-        if not unit and "sign" in self.stated:
-            return sentence.partition(_SIGN_ADVICE)[0] + "."
         quantity, (factor, offset) = (unit[1], unit_of(unit[1], unit[2])) if unit else ("current", (-1.0, 0.0))
-        if not (unit and quantity in self.stated):
+        if (quantity if unit else "sign") not in self.stated:
             name = next(each for each in self.arrays if each.startswith(quantity))
             try:
                 Discharge(**self.arrays | {name: factor * self.arrays[name] + offset})

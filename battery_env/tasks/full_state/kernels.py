@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled, inlined
-from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE, VO
+from battery_env.electrochemistry.cell import QNB, QNS, STATE_SIZE, VO, PackedConstants
 from battery_env.electrochemistry.kernels import (
     BLOCK,
     BLOCK_SIZE,
@@ -23,8 +23,8 @@ from battery_env.electrochemistry.kernels import (
     asinh_ratio,
     fill_block,
     states_of_block,
+    step_batch,
     step_of_block,
-    voltage_of_block,
 )
 from battery_env.tasks.full_state.layout import Records
 
@@ -80,26 +80,22 @@ def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> float
 @compiled
 def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArray) -> None:
     # Set the model's parameters, step it, and compare it with the measured state; then go on to the next sample
-    task, block = settings[0], np.empty(BLOCK_SIZE)
+    task = settings[0]
     state, next_state, model_state = cells["state"], cells["next_state"], cells["model_state"]
     for n in range(len(cells)):
         cells[n].decisions += 1
         cells[n].sample += 1
         cost[n] = task.consistency * _take_action(action, task, cells, n)
-    for first in range(0, len(cells), BLOCK):
-        size = min(BLOCK, len(cells) - first)
-        fill_block(
-            block, first, size, cells["model_state"], cells["load"], cells["q_mobile_hat"], cells["r_o_hat"], task.constants
-        )
-        step_of_block(block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p)
-        states_of_block(block, first, size, cells["model_state"])
-        for n in range(first, first + size):
-            cost[n] += _cost_of_state(model_state, next_state, n, task)
-            is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
-            for k in range(STATE_SIZE):
-                state[n, k] = next_state[n, k]
-                if is_set:
-                    model_state[n, k] = next_state[n, k]
+    load, q, r_o = cells["load"], cells["q_mobile_hat"], cells["r_o_hat"]
+    packed = PackedConstants(task.constants, task.polynomial_n, task.polynomial_p)
+    step_batch(model_state, load, q, r_o, task.dt_s, task.power, task.thermal, True, packed, model_state)
+    for n in range(len(cells)):
+        cost[n] += _cost_of_state(model_state, next_state, n, task)
+        is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
+        for k in range(STATE_SIZE):
+            state[n, k] = next_state[n, k]
+            if is_set:
+                model_state[n, k] = next_state[n, k]
 
 
 @compiled
@@ -120,22 +116,9 @@ def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray
 
 
 @compiled
-def model_voltage(settings: Records, cells: Records, out: FloatArray) -> None:
-    task, block = settings[0], np.empty(BLOCK_SIZE)
-    for first in range(0, len(cells), BLOCK):
-        size = min(BLOCK, len(cells) - first)
-        fill_block(
-            block, first, size, cells["model_state"], cells["load"], cells["q_mobile_hat"], cells["r_o_hat"], task.constants
-        )
-        voltage_of_block(block, size, True, task.polynomial_n, task.polynomial_p)
-        for j in range(size):
-            out[first + j] = block[VOLTAGE + j]
-
-
-@compiled
 def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.float32]) -> None:
     # The observations, into out
-    task, block = settings[0], np.empty(BLOCK_SIZE)
+    task = settings[0]
     per_state, per_error, model_state, next_state = task.per_state, task.per_error, cells["model_state"], cells["next_state"]
     for n in range(len(cells)):
         cell = cells[n]
@@ -152,21 +135,18 @@ def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.flo
     if not task.innovations:
         return
     q, r_o = np.full(len(cells), task.new_parameters[0]), np.full(len(cells), task.new_parameters[1])
+    packed = PackedConstants(task.constants, task.polynomial_n, task.polynomial_p)
+    predicted = np.empty((len(cells), STATE_SIZE))
+    innovations = predicted.ravel()
     for column, origin in ((15, model_state), (22, cells["state"])):
-        for first in range(0, len(cells), BLOCK):
-            size = min(BLOCK, len(cells) - first)
-            fill_block(block, first, size, origin, cells["load"], q, r_o, task.constants)
-            step_of_block(
-                block, size, task.dt_s, task.power, task.power, task.thermal, True, task.polynomial_n, task.polynomial_p
-            )
-            for j in range(size):
-                for k in range(1, 8):
-                    block[k * BLOCK + j] = (next_state[first + j, k] - block[k * BLOCK + j]) * per_error[k - 1]
-            # asinh: they span five orders of magnitude, and must not drown the small ones in a network. A loop of its own, so
-            # that the compiler uses vector instructions
-            for k in range(1, 8):
-                for j in range(size):
-                    block[k * BLOCK + j] = asinh_ratio(block[k * BLOCK + j], 1.0)
-            for j in range(size):
-                for k in range(7):
-                    out[first + j, k + column] = block[(k + 1) * BLOCK + j]
+        step_batch(origin, cells["load"], q, r_o, task.dt_s, task.power, task.thermal, True, packed, predicted)
+        for n in range(len(cells)):
+            for k in range(7):
+                predicted[n, k + 1] = (next_state[n, k + 1] - predicted[n, k + 1]) * per_error[k]
+        # asinh: they span five orders of magnitude, and must not drown the small ones in a network. A loop of its own, so that
+        # the compiler uses vector instructions
+        for j in range(len(innovations)):
+            innovations[j] = asinh_ratio(innovations[j], 1.0)
+        for n in range(len(cells)):
+            for k in range(7):
+                out[n, k + column] = predicted[n, k + 1]

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from battery_env.arrays import IntArray
 from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import NEW_CELL, FloatArray, Trajectory
+from battery_env.electrochemistry.kernels import voltage_batch
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
-from battery_env.tasks.full_state.kernels import decide, look_ahead, model_voltage, observe
+from battery_env.tasks.full_state.kernels import decide, look_ahead, observe
 from battery_env.tasks.full_state.layout import (
     CELL,
     CELL_WITH_CONSTANTS,
@@ -30,7 +31,7 @@ from battery_env.tasks.full_state.layout import (
     Formulation,
     Records,
 )
-from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
+from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
 from battery_env.trajectories import TrajectoryDataset
 
 # A model that was wrong for a while has moved too much or too little charge from one electrode to the other. In both
@@ -154,12 +155,7 @@ class FullStateTask(CalibrationTask):
             settings[name] = value
         return settings
 
-    def start(
-        self,
-        rows: NDArray[np.intp],
-        generators: Sequence[np.random.Generator],
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
+    def start(self, rows: Rows, generators: Generators, options: Mapping[str, Any] | None = None) -> None:
         """
         Start some cells at random points of random trajectories; as of the base class.
 
@@ -292,5 +288,5 @@ class FullStateTask(CalibrationTask):
     def report(self) -> dict[str, FloatArray]:
         """Where each cell stands after its last decision."""
         voltage_hat = np.empty(self.cells)
-        model_voltage(self._settings, self.now, voltage_hat)
+        voltage_batch(self.now["model_state"], self.now["q_mobile_hat"], True, self.dataset.cell.packed, voltage_hat)
         return {name: voltage_hat if name == "voltage_hat" else self.now[name].copy() for name in self.REPORTED}

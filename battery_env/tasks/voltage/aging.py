@@ -9,12 +9,11 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from battery_env.electrochemistry import CellParameters, FloatArray
 from battery_env.estimators.estimator import Record
 from battery_env.loads import RandomPiecewise
-from battery_env.tasks.task import check_counts
+from battery_env.tasks.task import Generators, Rows, check_counts
 from battery_env.tasks.voltage.task import VoltageTask
 from battery_env.trajectories import TrajectoryDataset
 
@@ -136,12 +135,7 @@ class BatteryAging(VoltageTask):
         inherited = {name: default for name, default in VoltageTask.options().items() if name not in decided}
         return {**inherited, **super(VoltageTask, cls).options()}
 
-    def start(
-        self,
-        rows: NDArray[np.intp],
-        generators: Sequence[np.random.Generator],
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
+    def start(self, rows: Rows, generators: Generators, options: Mapping[str, Any] | None = None) -> None:
         """Begin new lives."""
         discharge = (options or {}).get("discharge", 0)
         if discharge % self.cycles:

@@ -289,21 +289,9 @@ class _Rates(NamedTuple):
     gain_slope_d: float
     left_o: float  # of the ohmic drop
     slope_o: float
-    left_n: float  # of Vsn
-    slope_n: float
     left_d0: float  # with the constants of the model
     gain_d0: float
     left_o0: float
-
-
-class _Slopes(NamedTuple):
-    """The derivatives of Vsn at one reading by the logarithms of kn and tsn, and what is left after the interval before it."""
-
-    by_kn: float
-    by_tsn: float
-    steps: float
-    left: float
-    slope: float
 
 
 class _Linear(NamedTuple):
@@ -322,31 +310,24 @@ def _rates(model: Any, logarithms: FloatArray, steps: float) -> _Rates:
     constants, dt_s = model.constants, model.dt_s
     rate_d = constants[0, BULK_RATE] + constants[0, SURFACE_RATE]
     at_rest = constants[0, BULK_RATE] / rate_d
-    factor_d, factor_o, factor_n = np.exp(logarithms[1]), np.exp(logarithms[2]), np.exp(logarithms[3])
+    factor_d, factor_o = np.exp(logarithms[1]), np.exp(logarithms[2])
     left_d0, _ = _decay(rate_d, 1.0, steps, dt_s)
     left_o0, _ = _decay(constants[0, TO_RATE], 1.0, steps, dt_s)
     left_d, slope_d = _decay(rate_d, factor_d, steps, dt_s)
     left_o, slope_o = _decay(constants[0, TO_RATE], factor_o, steps, dt_s)
-    left_n, slope_n = _decay(constants[0, TSN_RATE], factor_n, steps, dt_s)
     gain_d0 = (1.0 - at_rest) * (1.0 - left_d0) / rate_d
     gain_d = (1.0 - at_rest) * (1.0 - left_d) * factor_d / rate_d
     gain_slope_d = gain_d - (1.0 - at_rest) * slope_d * factor_d / rate_d
-    return _Rates(steps, left_d, slope_d, gain_d, gain_slope_d, left_o, slope_o, left_n, slope_n, left_d0, gain_d0, left_o0)
+    return _Rates(steps, left_d, slope_d, gain_d, gain_slope_d, left_o, slope_o, left_d0, gain_d0, left_o0)
 
 
 @inlined
 def _follow_current(
-    block: FloatArray,
-    values: FloatArray,
-    size: int,
-    r_o: float,
-    model: Any,
-    logarithms: FloatArray,
-    rates: _Rates,
-    before: _Linear,
-) -> tuple[_Linear, _Rates]:
+    block: FloatArray, values: FloatArray, size: int, r_o: float, model: Any, logarithms: FloatArray, before: _Linear
+) -> _Linear:
     # From the states of the model's constants, in the block, to those of the fit, and their derivatives
     unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to = before
+    rates = _rates(model, logarithms, block[STEPS * BLOCK])
     for k in range(size):
         if block[STEPS * BLOCK + k] != rates.steps:
             rates = _rates(model, logarithms, block[STEPS * BLOCK + k])
@@ -363,15 +344,16 @@ def _follow_current(
         block[MOVED * BLOCK + k] = block[MOVED * BLOCK + k] + unequal - unequal_0
         block[OHMIC * BLOCK + k] = ohmic
         values[_T_DIFFUSION, k], values[_TO, k] = by_t_diffusion, -r_o * by_to
-    return _Linear(unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to), rates
+    return _Linear(unequal, unequal_0, ohmic, ohmic_0, by_t_diffusion, by_to)
 
 
 @inlined
 def _differentiate_vsn(
-    block: FloatArray, values: FloatArray, size: int, model: Any, factor: float, vsn: float, before: _Slopes
-) -> _Slopes:
+    block: FloatArray, values: FloatArray, size: int, model: Any, factor: float, vsn: float, before: tuple[float, float]
+) -> tuple[float, float]:
     # The derivatives by kn and tsn from the values that Vsn tends to, which values has by kn; returns the last ones
-    by_kn, by_tsn, steps, left, slope = before
+    by_kn, by_tsn = before
+    steps, left, slope = 0.0, 1.0, 0.0
     for k in range(size):
         if block[STEPS * BLOCK + k] != steps:
             steps = block[STEPS * BLOCK + k]
@@ -381,7 +363,7 @@ def _differentiate_vsn(
         by_kn += (1.0 - left) * (values[_KN, k] - by_kn)
         vsn += (1.0 - left) * (nominal - vsn)
         values[_KN, k], values[_TSN, k] = -by_kn, -by_tsn
-    return _Slopes(by_kn, by_tsn, steps, left, slope)
+    return by_kn, by_tsn
 
 
 @inlined
@@ -446,15 +428,15 @@ def _linearize(
             polynomial_p[k] += coefficient_V * added[j, 1 + k]
     share_n = min(model.dt_s * own[0, TSN_RATE] / np.exp(logarithms[3]), 0.99)
     share_p = model.dt_s * own[0, TSP_RATE]
-    linear, rates, overpotentials = _Linear(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), _rates(model, logarithms, 1.0), AT_REST
-    by_constants, moved_before, drawn_C = _Slopes(0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 0.0
+    linear, overpotentials = _Linear(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), AT_REST
+    by_constants, moved_before, drawn_C = (0.0, 0.0), 0.0, 0.0
     sums[:] = 0.0
     for low in range(0, end, BLOCK):
         size = min(BLOCK, end - low)
         take_readings(block, shown, n, low, size)
         for k in range(size):
             drawn_C += block[CURRENT * BLOCK + k] * block[STEPS * BLOCK + k] * model.dt_s
-        linear, rates = _follow_current(block, values, size, r, model, logarithms, rates, linear)
+        linear = _follow_current(block, values, size, r, model, logarithms, linear)
         padded = pad_block(block, size, moved_before)
         moved_before = block[MOVED * BLOCK + size - 1]
         nominal_overpotentials_of_block(block, padded, q, own)

@@ -272,19 +272,16 @@ def _linear_part(
 
 
 class Overpotentials(NamedTuple):
-    """Surface overpotentials at a reading, V, and what they went of their way since the one before."""
+    """Surface overpotentials at a reading, V."""
 
     vsn: float  # of the negative electrode
     vsp: float  # of the positive electrode
     further_vsn: float  # of the negative electrode at q (1 + ``RELATIVE_STEP``)
     further_vsp: float  # likewise of the positive one
-    steps: float  # of the model since the reading before
-    relaxed_n: float  # the share that Vsn went in these
-    relaxed_p: float  # likewise Vsp
 
 
 #: Before the first reading.
-AT_REST = Overpotentials(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+AT_REST = Overpotentials(0.0, 0.0, 0.0, 0.0)
 
 
 @inlined
@@ -330,7 +327,8 @@ def nominal_overpotentials_of_block(block: FloatArray, size: int, q: float, cons
 @inlined
 def relax_block(block: FloatArray, size: int, share_n: float, share_p: float, before: Overpotentials) -> Overpotentials:
     # From the values that overpotentials tend to, a share of the way with each step, to those that they have; returns the last
-    vsn, vsp, further_vsn, further_vsp, steps, relaxed_n, relaxed_p = before
+    vsn, vsp, further_vsn, further_vsp = before
+    steps, relaxed_n, relaxed_p = 0.0, 0.0, 0.0
     for k in range(size):
         if block[STEPS * BLOCK + k] != steps:
             steps = block[STEPS * BLOCK + k]
@@ -341,7 +339,7 @@ def relax_block(block: FloatArray, size: int, share_n: float, share_p: float, be
         further_vsp += relaxed_p * (block[FURTHER_VSP * BLOCK + k] - further_vsp)
         block[VSN * BLOCK + k], block[VSP * BLOCK + k] = vsn, vsp
         block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = further_vsn, further_vsp
-    return Overpotentials(vsn, vsp, further_vsn, further_vsp, steps, relaxed_n, relaxed_p)
+    return Overpotentials(vsn, vsp, further_vsn, further_vsp)
 
 
 @compiled

@@ -20,7 +20,7 @@ from battery_env.parameters import PARAMETER_NAMES, columns_of
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
-from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, check_counts, checked_action
+from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
 from battery_env.tasks.voltage.fit import FitPrior, Fitted, NuisanceFit
 from battery_env.tasks.voltage.readings import CURRENT, MEASURED, OHMIC, SHOWN, Readings, explain
 from battery_env.trajectories import TrajectoryDataset
@@ -223,12 +223,7 @@ class VoltageTask(CalibrationTask):
         """
         return {**super().options(), **asdict(SENSORS)}
 
-    def start(
-        self,
-        rows: NDArray[np.intp],
-        generators: Sequence[np.random.Generator],
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
+    def start(self, rows: Rows, generators: Generators, options: Mapping[str, Any] | None = None) -> None:
         """
         Begin new episodes, each at a random reading of a random discharge; as of the base class.
 
@@ -377,7 +372,7 @@ class VoltageTask(CalibrationTask):
             self._shown[CURRENT : OHMIC + 1, row, :length] = measured
         voltage_V[:] = read_V
 
-    def _explain(self, rows: NDArray[np.intp] | None = None) -> None:
+    def _explain(self, rows: Rows | None = None) -> None:
         """Compare some cells with their readings, all by default."""
         of_cells = np.arange(self.cells) if rows is None else np.asarray(rows, dtype=np.int64)
         read = (of_cells, self.count, self._estimate, self._shown)
