@@ -175,7 +175,8 @@ class TestCharge:
     )
     def test_one_that_ended_at_a_tenth_by_a_reading_before_it_tapered_off(self, share, tapered):
         current_A = -np.append(np.full(50, 3.0), 3.0 * np.linspace(share + 0.02, share, 50))
-        assert ChargeBefore.of(10.0 * np.arange(100), np.append(np.linspace(3.8, 4.2, 50), np.full(50, 4.2)), current_A).tapered == tapered
+        voltage_V = np.append(np.linspace(3.8, 4.2, 50), np.full(50, 4.2))
+        assert ChargeBefore.of(10.0 * np.arange(100), voltage_V, current_A).tapered == tapered
 
     def test_noise_at_its_end_is_no_taper(self):
         voltage_V, current_A = np.append(np.linspace(3.8, 4.1, 50), 4.0), -np.append(np.full(50, 3.0), 0.02)
