@@ -210,20 +210,30 @@ class Discharge:
             raise ValueError(f"cut_off_V must be a voltage in V, got {cut_off_V!r}")
         first, last = self._loaded
         below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V) + first
+        for end in self._ends_of_loads(first, int(below[0]) if len(below) else last):
+            if self._ends_at(cut_off_V, end):
+                return end
         if not len(below):
-            return last if self._ends_at(cut_off_V) else None
+            return None
         begin = int(below[0])
         back = np.flatnonzero(self.voltage_V[begin : last + 1] > cut_off_V) + begin
         if begin > 0 and len(back):
             self._refuse_dip(begin, int(back[0]), cut_off_V)
         return begin
 
-    def _ends_at(self, cut_off_V: float) -> bool:
+    def _ends_of_loads(self, first: int, last: int) -> list[int]:
+        """The last samples of loads, from one sample to another, after which only smaller ones follow in the discharge."""
+        current_A = np.append(self.current_A[first : self._loaded[1] + 1], 0.0)
+        largest_later_A = np.maximum.accumulate(current_A[:0:-1])[::-1]
+        ends = np.flatnonzero(largest_later_A < (1.0 - SWITCH_SHARE) * current_A[:-1]) + first
+        return [int(end) for end in ends if end <= last]
+
+    def _ends_at(self, cut_off_V: float, last: int) -> bool:
         """
-        Whether the last sample under load is as near to the cut-off as the one an interval before it is to that sample: a
+        Whether the last sample of a load is as near to the cut-off as the one an interval before it is to that sample: a
         tester stops by a reading that it need not write. The row of the end itself may lie just behind a regular one.
         """
-        first, last = self._loaded
+        first, _ = self._loaded
         interval_s = float(np.median(np.diff(self.time_s[first : last + 1]))) if last > first else 0.0
         before = max(int(np.searchsorted(self.time_s, self.time_s[last] - 0.5 * interval_s)) - 1, 0)
         is_steady = abs(self.current_A[last] - self.current_A[before]) <= SWITCH_SHARE * self.current_A.max()

@@ -196,6 +196,20 @@ class TestCutOff:
         assert over.capacity_Ah == pytest.approx(plain.capacity_Ah, rel=1e-3)
         assert over.r_o_ohm == pytest.approx(plain.r_o_ohm, rel=1e-3)
 
+    @pytest.mark.parametrize("stop_V", [2.6997, 2.7003, 2.703])
+    @pytest.mark.parametrize("later_A", [[1.0], [1.0, 0.3]])
+    def test_capacity_is_that_of_the_first_load_that_ends_there(self, stop_V, later_A):
+        """Rate steps: each smaller load draws some more."""
+        parts, state, now_s = [([0.0], [4.19], [0.0])], None, 10.0
+        for load_A, until in ((3.0, "eod"), *((A, "eod") if A else (A, 900.0) for later in later_A for A in (0.0, later))):
+            made = simulate(load_A, 6800.0, 0.12, until, load_unit="current", cut_off_V=stop_V, initial=state)
+            kept = np.append(np.arange(0, len(made.time_s) - 1, 5), len(made.time_s) - 1)
+            parts.append((now_s + made.time_s[kept], made.voltage_V[kept], np.full(len(kept), load_A)))
+            state, now_s = made.state[-1], now_s + made.time_s[-1] + 1.0
+        found = calibrate(Discharge(*map(np.concatenate, zip(*parts, strict=True))))
+        first_C = 3.0 * (parts[1][0][-1] - 10.0)
+        assert 3600.0 * found.capacity_Ah == pytest.approx(first_C, rel=3e-3)
+
     def test_an_earlier_end_is_none(self):
         assert calibrate(REAL.until(REAL.time_s[200])).in_progress
         fall_V = float(REAL.voltage_V[199] - REAL.voltage_V[200])
