@@ -32,6 +32,7 @@ from battery_env.records.samples import Stream
 from battery_env.sensors import SensorErrors
 from battery_env.tasks.voltage.pages import BatteryVoltageJoint, BatteryVoltageQmax
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES
+from tests.policies import Always
 
 AGES = 5
 LOAD = constant(2.0, "current")
@@ -298,11 +299,8 @@ class TestCalibrations:
             Settings(path=path)
 
 
-class Fit:
-    """A policy that leaves the estimate where the fit in its observation puts it."""
-
-    def predict(self, observation, deterministic=False):
-        return np.zeros((len(observation), 2), dtype=np.float32), None
+#: It leaves the estimate where the fit in its observation puts it.
+FIT = Always(0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -312,7 +310,7 @@ def whole():
 
 @pytest.fixture(scope="module")
 def along(b0006):
-    return PolicyEstimator(Fit(), "BatteryVoltageJoint-v0", path=b0006)
+    return PolicyEstimator(FIT, "BatteryVoltageJoint-v0", path=b0006)
 
 
 class TestTask:
@@ -350,7 +348,7 @@ class TestTask:
 
     def test_intervals_along_the_path_hold(self, path):
         data = TrajectoryDataset.along(path, 60, [constant(1.5, "current"), LOAD], seed=7)
-        estimator = PolicyEstimator(Fit(), "BatteryVoltageJoint-v0", path=path)
+        estimator = PolicyEstimator(FIT, "BatteryVoltageJoint-v0", path=path)
         scores = evaluate(estimator, data, SensorErrors(0.002), seed=1)
         # of cells of the path itself the double of what the fit states holds nearly always
         assert scores["q_mobile_coverage_percent"].mean() > 97.0

@@ -11,6 +11,7 @@ from battery_env import ExtendedKalmanFilter, PolicyEstimator
 from battery_env.electrochemistry import simulate
 from battery_env.records import Stream, are_plausible, check_sample
 from battery_env.records.discharge import Discharge
+from tests.policies import Always
 
 NOISE_V = 0.005
 
@@ -26,19 +27,8 @@ def follow(estimator, record, dt_s=1.0, temperature_C=None):
     return estimate
 
 
-class Nudge:
-    """A policy that goes down, and remembers what it saw."""
-
-    def __init__(self, *action):
-        self.action, self.seen = np.array(action), []
-
-    def predict(self, observation, deterministic=False):
-        self.seen.append(observation)
-        return np.tile(self.action, (len(observation), 1)), None
-
-
 def policy_estimator(**more):
-    return PolicyEstimator(Nudge(-0.2, 0.1), "BatteryVoltageJoint-v0", **more)
+    return PolicyEstimator(Always(-0.2, 0.1), "BatteryVoltageJoint-v0", **more)
 
 
 @pytest.fixture(params=[lambda: ExtendedKalmanFilter(thermal=True), policy_estimator], ids=["filter", "policy"])
@@ -201,7 +191,7 @@ class TestPolicies:
     def test_one_with_the_full_state_or_a_whole_life_takes_none(self):
         for id_, action in (("BatteryQmax-v0", [0.0]), ("BatteryAging-v0", [0.0, 0.0])):
             with pytest.raises(ValueError, match=f"a policy of {id_} takes no stream"):
-                PolicyEstimator(Nudge(*action), id_).update(4.19, 2.0, 0.0)
+                PolicyEstimator(Always(*action), id_).update(4.19, 2.0, 0.0)
 
 
 class TestFiles:
