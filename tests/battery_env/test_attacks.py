@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
+from battery_env import NEW_CELL, Discharge, PolicyEstimator, Settings, initial_state, load_nasa_discharges, simulate
 from battery_env.estimates import last_estimate
 from battery_env.estimators import (
     CellFit,
@@ -34,11 +34,8 @@ from battery_env.estimators import (
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.lab.calibrate import Ahead, calibrated
 from battery_env.lab.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
-from battery_env.lab.settings import Settings
-from battery_env.policies.estimator import PolicyEstimator
 from battery_env.policies.pretrained import pretrained_ids
 from battery_env.records import Samples, Stream
-from battery_env.records.discharge import Discharge, load_nasa_discharges
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES
 
 WRONG_SHARE = 0.05

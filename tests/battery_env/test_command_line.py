@@ -13,18 +13,14 @@ import pandas as pd
 import pytest
 
 import battery_env
+from battery_env import Calibration, Discharge, LeastSquares, PolicyEstimator, Settings, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.ends import MEMORY_SHARE
 from battery_env.estimators.cell_fit import read_cell
-from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab import many
 from battery_env.lab.calibrate import calibrate as calibrated
 from battery_env.lab.command_line import main
-from battery_env.lab.report import Calibration
-from battery_env.lab.settings import Settings
 from battery_env.loads import constant, in_steps
-from battery_env.policies.estimator import PolicyEstimator
-from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 
 @pytest.fixture(scope="module")

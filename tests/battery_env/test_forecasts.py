@@ -9,9 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
+from battery_env import NEW_CELL, Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
 from battery_env.__main__ import calibrate, main
-from battery_env.electrochemistry import NEW_CELL
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.estimates import last_estimate
 from battery_env.estimators import ExtendedKalmanFilter

@@ -7,13 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import LeastSquares, fit_cell, load_nasa_discharges, soc_from_rest
+from battery_env import Discharge, LeastSquares, RecordModel, fit_cell, load_nasa_discharges, soc_from_rest, track_life
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.lab.command_line import NOT_SETTLED, SETTLED, calibrate
-from battery_env.lab.life import track_life
 from battery_env.loads import constant, in_steps
-from battery_env.records.discharge import Discharge
-from battery_env.records.model import RecordModel
 
 REST_S = 200
 

@@ -5,16 +5,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from battery_env.electrochemistry import NEW_CELL, simulate
+from battery_env import NEW_CELL, ExtendedKalmanFilter, SensorErrors, TrajectoryDataset, load_nasa_discharges, simulate
 from battery_env.estimates import EstimateTrace
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
 from battery_env.estimators.estimator import OnlineEstimator
-from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise
-from battery_env.records.discharge import load_nasa_discharges
-from battery_env.sensors import SensorErrors
-from battery_env.trajectories import TrajectoryDataset
 
 NOISE_V = 0.005
 
@@ -122,17 +118,6 @@ class TestOnline:
             for name in (field.name for field in fields(EstimateTrace)):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
         assert filter_.estimate(records[1]).q_mobile == batch[1].q_mobile[-1]
-
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            ({"mismatch_V": 0.05, "voltage_noise_V": 0.005}, "voltage_noise_V must be at least mismatch_V, 0.05 V, got 0.005"),
-            ({"prior_r_o_ohm": (0.1, 0.0)}, "prior of r_o"),
-        ],
-    )
-    def test_arguments_out_of_range_are_refused(self, arguments, message):
-        with pytest.raises(ValueError, match=message):
-            ExtendedKalmanFilter(**arguments)
 
 
 class TestRealCells:

@@ -6,10 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
-from battery_env.electrochemistry import NEW_CELL
+from battery_env import NEW_CELL, Discharge, load_nasa_discharges
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, RandomWalk, constant, recorded
 from battery_env.records import Samples
-from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 
 def piecewise(values, durations_s):

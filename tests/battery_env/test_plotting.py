@@ -6,9 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env.electrochemistry import simulate
+from battery_env import RecordModel, SensorErrors, forecast, simulate
 from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, sensitivities
-from battery_env.lab.forecast import forecast
 from battery_env.plotting import (
     COLOUR_OF,
     COLOURS,
@@ -22,8 +21,6 @@ from battery_env.plotting import (
     plot_true_against_inferred,
 )
 from battery_env.records import Samples
-from battery_env.records.model import RecordModel
-from battery_env.sensors import SensorErrors
 
 
 @pytest.fixture

@@ -5,15 +5,12 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from battery_env import PolicyEstimator
-from battery_env.electrochemistry import NEW_CELL, CellParameters
-from battery_env.evaluation import evaluate
+from battery_env import NEW_CELL, CellParameters, PolicyEstimator, TrajectoryDataset, evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.voltage.aging import simulated_lives
 from battery_env.tasks.voltage.task import LARGEST_STEPS
-from battery_env.trajectories import TrajectoryDataset
 from tests.policies import Always
 
 

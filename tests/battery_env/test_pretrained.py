@@ -11,12 +11,10 @@ from itertools import product
 import numpy as np
 import pytest
 
-from battery_env import AgingPath, LeastSquares, PolicyEstimator, evaluate, load_nasa_discharges
-from battery_env.electrochemistry import NEW_CELL
+from battery_env import NEW_CELL, AgingPath, LeastSquares, PolicyEstimator, SensorErrors, evaluate, load_nasa_discharges
 from battery_env.estimates import last_estimate
 from battery_env.policies.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_policy
 from battery_env.records.discharge import BUNDLED_CELLS
-from battery_env.sensors import SensorErrors
 from battery_env.tasks.data import standard_dataset
 
 FOLDER = files("battery_env.policies.pretrained_policies")

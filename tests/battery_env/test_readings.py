@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
+from battery_env import TrajectoryDataset, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, QNB, QNS, VO, simulate
 from battery_env.loads import RandomPiecewise
-from battery_env.records.discharge import load_nasa_discharges
 from battery_env.tasks.voltage.readings import SHOWN, Readings, explain
-from battery_env.trajectories import TrajectoryDataset
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from battery_env.electrochemistry import simulate
-from battery_env.lab.readers.discharges import read_discharge_csv, read_discharges
+from battery_env import read_discharge_csv, read_discharges, simulate
 
 # two samples at rest, a load of 2 A, and a rest
 TIME_S = np.concatenate([[0.0, 5.0], np.arange(10.0, 1810.0, 30.0), [1815.0, 1830.0]])

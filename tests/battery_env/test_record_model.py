@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from battery_env import Estimate, RecordModel
 from battery_env.electrochemistry import NEW_CELL, QNS, QPS, initial_state, simulate
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
-from battery_env.estimates import Estimate
 from battery_env.loads import constant, in_steps
-from battery_env.records.model import RecordModel
 
 CURRENT_A = np.repeat(np.random.default_rng(0).uniform(0.5, 2.5, 40), 75)
 RECORD = simulate(2.0, 6000.0, 0.15, load_unit="current")

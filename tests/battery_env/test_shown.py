@@ -6,14 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import calibrate, load_nasa_discharges, read_discharges
+from battery_env import Discharge, Settings, calibrate, load_nasa_discharges, read_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators.diagnosis.gaps import doubtful_C
 from battery_env.estimators.diagnosis.samples import fault_condition, unseen_C, watched
 from battery_env.estimators.estimator import OnlineEstimator
-from battery_env.lab.settings import Settings
 from battery_env.records import ChargeBefore, Samples, Shown, Stream
-from battery_env.records.discharge import Discharge
 from battery_env.records.switches import switched_sd_C
 
 METHODS = ("least-squares", "kalman")

@@ -7,10 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env import ExtendedKalmanFilter, PolicyEstimator
-from battery_env.electrochemistry import simulate
+from battery_env import Discharge, ExtendedKalmanFilter, PolicyEstimator, simulate
 from battery_env.records import Stream, are_plausible, check_sample
-from battery_env.records.discharge import Discharge
 from tests.policies import Always
 
 NOISE_V = 0.005

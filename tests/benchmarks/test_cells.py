@@ -6,8 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import PolicyEstimator, TrajectoryDataset
-from battery_env.records.discharge import load_nasa_discharges
+from battery_env import PolicyEstimator, TrajectoryDataset, load_nasa_discharges
 from benchmarks import cells
 from benchmarks.calibrators import ENV_ID, Follow
 from tests.policies import Always

@@ -15,8 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 
-from battery_env.estimators.closed_form import ClosedForm
-from battery_env.evaluation import evaluate
+from battery_env import ClosedForm, evaluate
 from benchmarks import compare, contests
 from benchmarks.training import Recipe
 
