@@ -374,15 +374,6 @@ def test_exact_value_is_the_mean_discounted_sum_of_costs():
         assert exact[quarter].mean() == pytest.approx(sums[quarter].mean(), rel=0.03)
 
 
-def test_largest_feasible_alpha3_is_that_of_roll_outs():
-    env = LinearCostEnv(noise_std=0.1)
-    gain = env.optimal_gain(GAMMA)
-    states, costs = linear_roll_outs(env, gain, n_episodes=5000, n_steps=100)
-    values = np.array([env.cost_to_go(s, -s @ gain.T, gain, GAMMA) for s in states])
-    expected = (values[:-1] - values[1:]).sum() / costs.sum()
-    assert env.largest_feasible_alpha3(gain, GAMMA) == pytest.approx(expected, rel=0.05)
-
-
 @pytest.mark.parametrize(
     ("make", "kwargs", "message"),
     [
