@@ -59,10 +59,6 @@ class TestDischarge:
             Discharge(**recorded(**changes))
         assert "\n" not in str(caught.value)
 
-    def test_load_is_switched_on_midway_between_the_samples(self):
-        assert Discharge(**recorded()).load_on_time_s == 15.0
-        assert Discharge(**recorded(current_A=np.full(7, 2.0))).load_on_time_s == 0.0
-
     @pytest.mark.parametrize(("rest_every_s", "gap_s"), [(600.0, 600.0), (600.0, 20.0), (120.0, 200.0)])
     def test_a_rest_that_is_seldom_logged_does_not_switch_the_load_on_before_its_samples(self, rest_every_s, gap_s):
         rest_s = rest_every_s * np.arange(4)

@@ -340,15 +340,6 @@ def test_what_is_drawn_after_the_cut_off_is_told(recorded, tmp_path, terminal):
     assert "Ah more are drawn after the cut-off at" in row["notes"] and row["capacity_Ah"] is None
 
 
-def test_a_load_that_ends_above_the_cut_off_is_told(recorded, tmp_path, terminal):
-    last_s, rest_s = recorded.time_s[-1], 10.0 + 10.0 * np.arange(30)
-    columns = (recorded.time_s, last_s + rest_s), (recorded.voltage_V, 3.2 + 0 * rest_s), (recorded.current_A, 0 * rest_s)
-    path = write(Discharge(*map(np.concatenate, columns)), tmp_path / "cell.csv")
-    said = "if the cell was discharged no further, state cut_off_V (--cut-off)"
-    assert said in terminal.row(path, "--cut-off", 2.0, "--discharge-is-positive")["notes"]
-    assert said not in (terminal.row(path, "--discharge-is-positive")["notes"] or "")
-
-
 def test_a_file_with_unknown_columns_lists_them_and_takes_them_from_the_command_line(recorded, tmp_path, terminal):
     path = tmp_path / "cell.csv"
     columns = {"t_min": recorded.time_s / 60.0, "a": 1e3 * recorded.voltage_V, "b": recorded.current_A}

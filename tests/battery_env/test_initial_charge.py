@@ -35,12 +35,6 @@ class TestStart:
         for q_mobile in (4000.0, 7600.0):
             np.testing.assert_allclose(model.start(q_mobile), initial_state(q_mobile, soc=soc), rtol=1e-12, atol=1e-9)
 
-    def test_tangents_know_of_it(self):
-        model, load_A = RecordModel(initial_soc=0.6), np.full(600, 2.0)
-        _, by_q, _ = model.sensitivities(load_A, 6000.0, 0.15)
-        above, below = (model.sensitivities(load_A, 6000.0 + step, 0.15)[0] for step in (1.0, -1.0))
-        np.testing.assert_allclose(by_q, 0.5 * (above - below), rtol=1e-4, atol=1e-9)
-
 
 class TestRest:
     @pytest.mark.parametrize("soc", [0.15, 0.5, 0.97])

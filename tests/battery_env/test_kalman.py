@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from battery_env import NEW_CELL, ExtendedKalmanFilter, SensorErrors, TrajectoryDataset, load_nasa_discharges, simulate
+from battery_env import NEW_CELL, ExtendedKalmanFilter, SensorErrors, TrajectoryDataset, simulate
 from battery_env.estimates import EstimateTrace
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
 from battery_env.estimators.estimator import OnlineEstimator
@@ -118,20 +118,3 @@ class TestOnline:
             for name in (field.name for field in fields(EstimateTrace)):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
         assert filter_.estimate(records[1]).q_mobile == batch[1].q_mobile[-1]
-
-
-class TestRealCells:
-    def test_it_finds_the_charge_of_a_real_cell_over_its_life(self):
-        discharges = load_nasa_discharges("B0005")[::12]
-        records = [discharge.loaded_part(2.7) for discharge in discharges]
-        traces = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05).trace(records)
-        final = np.array([trace.q_mobile[-1] for trace in traces])
-        capacity_Ah = np.array([discharge.meta["capacity_Ah"] for discharge in discharges])
-        assert np.corrcoef(final, capacity_Ah)[0, 1] > 0.999
-        np.testing.assert_allclose(final / (3600.0 * capacity_Ah), 1.055, atol=0.03)
-        assert all(trace.settled[-1] for trace in traces)
-        # honest half-way, where the voltage determines little
-        for trace, q_mobile in zip(traces, final, strict=True):
-            middle = len(trace.time_s) // 2
-            assert abs(trace.q_mobile[middle] - q_mobile) < 2.0 * trace.sd_q_mobile[middle]
-            assert not trace.settled[middle]

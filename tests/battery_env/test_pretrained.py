@@ -94,15 +94,6 @@ def test_without_onnxruntime_the_error_names_the_extra(monkeypatch):
         PolicyEstimator.pretrained()
 
 
-def test_a_stream_does_not_go_on_with_another_policy(tmp_path):
-    stream = PolicyEstimator.pretrained()
-    stream.update(4.19, 2.0, 0.0)
-    saved = stream.save(tmp_path / "state.npz")
-    PolicyEstimator.pretrained().load(saved)
-    with pytest.raises(ValueError, match="is of an estimator with "):
-        PolicyEstimator.pretrained(recorded=True).load(saved)
-
-
 class TestFiles:
     @pytest.fixture
     def copy(self, tmp_path):

@@ -186,7 +186,7 @@ class TestCutOff:
     def test_a_load_that_was_switched_off_is_over_and_has_the_method_of_a_whole_one(self):
         off = np.arange(len(REAL.time_s)) > 200
         record = replace(REAL, current_A=np.where(off, 0.0, REAL.current_A), voltage_V=np.where(off, 3.7, REAL.voltage_V))
-        with pytest.warns(UserWarning, match="the load ends at"):
+        with pytest.warns(UserWarning, match=r"the load ends at .* no further, state cut_off_V \(--cut-off\)"):
             assert calibrate(record).method == "least-squares"
 
 
