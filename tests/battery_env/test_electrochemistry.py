@@ -25,18 +25,6 @@ REFERENCE_8W_ISOTHERMAL = {
     3000: (292.1, 0.287304, 0.094277, 0.003586, 774.787937, 55.254009, 10625.212063, 1211.412658, 3.257963),
     3101: (292.1, 0.309179, 0.098459, 0.004853, 546.809368, 27.789045, 10853.190632, 1238.877622, 3.004657),
 }
-# by power in W and q_mobile in C, for r_o of 0.1, 0.117215, 0.15 and 0.2 ohm
-EOD_TIMES_S = {
-    (8, 4000): (1605, 1581, 1531, 1439),
-    (8, 6000): (2464, 2427, 2350, 2206),
-    (8, 7600): (3150, 3102, 3004, 2817),
-    (12, 4000): (979, 950, 874, 395),
-    (12, 6000): (1523, 1478, 1339, 613),
-    (12, 7600): (1956, 1898, 1689, 777),
-    (16, 4000): (659, 606, 275, 27),
-    (16, 6000): (1041, 919, 440, 38),
-    (16, 7600): (1342, 1163, 565, 53),
-}
 
 Q_MOBILE = st.floats(3500.0, 8000.0)
 R_O = st.floats(0.05, 0.3)
@@ -56,12 +44,6 @@ def test_reference_trajectories_to_all_printed_digits(load, load_unit, thermal, 
     for t, expected in reference.items():
         found = [*discharge.state[t], discharge.voltage_V[t]]
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=5.1e-7, err_msg=f"t = {t}")
-
-
-@pytest.mark.parametrize(("power", "q_mobile"), EOD_TIMES_S)
-def test_end_of_discharge_times(power, q_mobile):
-    found = [simulate(float(power), q_mobile, r_o).eod_time_s for r_o in (0.1, 0.117215, 0.15, 0.2)]
-    assert tuple(found) == EOD_TIMES_S[power, q_mobile]
 
 
 def test_agrees_with_progpy_on_random_cells_and_loads():
