@@ -7,7 +7,6 @@ from battery_env import NEW_CELL, Estimate, RecordModel, load_nasa_discharges, s
 from battery_env.estimators.cramer_rao import cramer_rao_bound, sensitivities
 
 NOISE_V = 0.010
-BOTH = ("q_mobile", "r_o")
 
 
 @pytest.fixture(scope="module")

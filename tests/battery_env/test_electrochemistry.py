@@ -27,7 +27,6 @@ REFERENCE_8W_ISOTHERMAL = {
 }
 
 Q_MOBILE = st.floats(3500.0, 8000.0)
-R_O = st.floats(0.05, 0.3)
 
 
 @pytest.mark.parametrize(

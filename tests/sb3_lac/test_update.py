@@ -12,20 +12,9 @@ from tests.sb3_lac.equations import mlp, policy_sample
 
 GAMMA, TAU, LEARNING_RATE, LAMBDA_LEARNING_RATE, ALPHA3 = 0.9, 0.05, 1e-2, 2e-2, 0.3
 LAMBDA_MIN, LAMBDA_MAX = 0.1, 1.0
-SETTINGS = {
-    "gamma": GAMMA,
-    "tau": TAU,
-    "alpha3": ALPHA3,
-    "ent_coef": "auto_0.7",
-    "lambda_init": 0.5,
-    "learning_rate": LEARNING_RATE,
-}
-SETTINGS |= {
-    "lambda_learning_rate": LAMBDA_LEARNING_RATE,
-    "lambda_init": 0.5,
-    "lambda_min": LAMBDA_MIN,
-    "lambda_max": LAMBDA_MAX,
-}
+SETTINGS = {"gamma": GAMMA, "tau": TAU, "alpha3": ALPHA3, "ent_coef": "auto_0.7", "lambda_init": 0.5}
+SETTINGS |= {"learning_rate": LEARNING_RATE, "lambda_learning_rate": LAMBDA_LEARNING_RATE}
+SETTINGS |= {"lambda_min": LAMBDA_MIN, "lambda_max": LAMBDA_MAX}
 
 
 def mean_action(weights, obs):
