@@ -381,7 +381,12 @@ def test_binary_files_of_neware_and_biologic_go_by_the_names_of_its_readers(tmp_
     neware, biologic = types.ModuleType("NewareNDA"), types.ModuleType("galvani.BioLogic")
     table = pd.DataFrame(named("Time", "Voltage", "Current(mA)", "T1", (1.0, 1.0, -1e3)) | {"Cycle": 1})
     table = table.assign(Step=np.where(LOADED, 2, 1), Status=np.where(LOADED, "CC_DChg", "Rest")).drop(columns="T1")
-    neware.read = lambda path, log_level: table.assign(Timestamp=pd.Timestamp("2026-02-28"))
+
+    def read(path, log_level):
+        warnings.warn("this will change in pandas 4", FutureWarning, stacklevel=2)  # which is no matter of who reads a record
+        return table.assign(Timestamp=pd.Timestamp("2026-02-28"))
+
+    neware.read = read
     records = np.rec.fromarrays([TIME_S, -1e3 * CURRENT_A, VOLTAGE_V], names="time/s,I/mA,Ewe/V")
     biologic.MPRfile = lambda stream: types.SimpleNamespace(data=records)
     monkeypatch.setitem(sys.modules, "NewareNDA", neware)

@@ -138,17 +138,17 @@ class TestCharge:
         counted = table.assign(cycle=np.where(table.current_A <= 0.0, 2, 1) if rest_rows == 0 else 1)
         assert len(read_discharges(counted)) == 1 and read_discharges(counted)[0].shown.charge is not None
 
-    def test_one_that_tapered_off_too_low_is_none_of_these_constants(self):
-        (found,) = calibrate(cycled(4.1, 0.05, soc=0.92))
-        assert not found.settled and "ended at 4.10 V" in found.reason
-
-    def test_a_rest_of_a_minute_tells_more_than_the_charge(self):
-        (found,) = calibrate(cycled(4.25, 3.0, rest_rows=100))
-        assert found.settled
-
-    def test_another_charge_that_is_stated_counts_more(self):
-        (found,) = calibrate(cycled(4.1, 3.0, 100, soc=0.9), initial_soc=0.9)
-        assert found.settled and is_right(found)
+    @pytest.mark.parametrize(
+        ("table", "stated", "reason"),
+        [
+            (cycled(4.1, 0.05, soc=0.92), {}, "ended at 4.10 V"),  # too low for these constants
+            (cycled(4.25, 3.0, rest_rows=100), {}, ""),  # a rest of a minute
+            (cycled(4.1, 3.0, 100, soc=0.9), {"initial_soc": 0.9}, ""),
+        ],
+    )
+    def test_a_rest_or_what_is_stated_tells_more_than_a_charge(self, table, stated, reason):
+        (found,) = calibrate(table, **stated)
+        assert found.settled == (not reason) and reason in found.reason and is_right(found)
 
     @pytest.mark.parametrize(
         ("share", "tapered"), [(0.0999, True), (0.1003, True), (0.104, True), (0.11, False), (0.2, False)]
