@@ -172,16 +172,6 @@ def test_a_name_has_one_colour_in_all_figures():
     assert [colour for colour, _ in coloured(["replaced", 0.01])] == list(COLOURS[:2])
 
 
-def test_pulses_are_drawn_by_their_envelope():
-    pulses = simulate(np.tile(np.repeat([4.0, 0.0], 10), 300), 6000.0, 0.1, load_unit="current")
-    record = Samples(pulses.time_s, pulses.voltage_V, pulses.current_A)
-    voltage, current, _ = plot_discharge(record, {"model": RecordModel().forecast(record, Estimate(6000.0, 0.1))}).axes
-    for line in (voltage.lines[0], voltage.lines[1], current.lines[0]):
-        low, high = np.split(line.get_ydata(), np.flatnonzero(np.isnan(line.get_xdata())))
-        assert len(low) == len(high) - 1 < len(record.time_s) / 20 and (low <= high[1:]).all()
-    assert set(low[:-1]) == {0.0} and set(high[1:]) == {4.0}
-
-
 def test_a_discharge_in_progress_ends_in_a_band(record):
     seen = Samples.of(record).first(1000)
     model = {"model": RecordModel().forecast(seen, Estimate(6000.0, 0.15))}

@@ -62,6 +62,17 @@ def test_later_readings_and_the_blocks_they_come_in_change_nothing(readings, rea
     assert (one_more[4] != part[4]).all()
 
 
+@pytest.mark.parametrize("name", ["q_mobile", "r_o"])
+def test_sensitivities_are_the_slopes_of_the_residuals(readings, name):
+    q_mobile, r_o = readings.q_mobile * 1.1, readings.r_o.copy()
+    before = compare(readings, q_mobile, r_o)
+    step = {"q_mobile": 1.0, "r_o": 1e-3}[name]
+    after = compare(readings, q_mobile + step * (name == "q_mobile"), r_o + step * (name == "r_o"))
+    slope = -(after[0] - before[0]) / step
+    expected = before[1] if name == "q_mobile" else -before[2]
+    np.testing.assert_allclose(slope, expected, rtol=0.05, atol=1e-8)
+
+
 def test_the_misfit_grows_with_every_coulomb_below_what_was_drawn(readings):
     """Also where the model cell is empty before the readings end: there is no second minimum of such cells."""
     misfits_V = [compare(readings, readings.q_mobile * share, readings.r_o)[3] for share in (0.98, 0.95, 0.9, 0.8, 0.6)]
