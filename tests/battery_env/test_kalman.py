@@ -1,12 +1,14 @@
 """The Kalman filter: accurate, honest about its uncertainty, and hard to lose; and the interface of online calibrators."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from battery_env import NEW_CELL, ExtendedKalmanFilter, SensorErrors, TrajectoryDataset, simulate
+from battery_env.estimates import EstimateTrace
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
+from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise
 
@@ -105,3 +107,14 @@ class TestGuards:
         estimate = ExtendedKalmanFilter().estimate(measured(6000.0, 0.2, 16.0))
         assert abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile and not estimate.settled
         assert estimate.r_o == pytest.approx(0.2, rel=0.02)
+
+
+class TestOnline:
+    def test_updates_and_traces_agree(self):
+        records = [measured(seed=n, q_mobile=q).part(0, 700) for n, q in enumerate((7000.0, 4000.0))]
+        filter_ = ExtendedKalmanFilter()
+        batch, single = filter_.trace(records), OnlineEstimator.trace(filter_, records)
+        for one, other in zip(batch, single, strict=True):
+            for name in (field.name for field in fields(EstimateTrace)):
+                np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+        assert filter_.estimate(records[1]).q_mobile == batch[1].q_mobile[-1]
