@@ -305,7 +305,7 @@ FIT = Always(0.0, 0.0)
 
 @pytest.fixture(scope="module")
 def whole():
-    return [each.loaded_part(2.7) for each in load_nasa_discharges("B0005")[2::40]]
+    return [each.loaded_part(2.7) for each in load_nasa_discharges("B0005")[2::80]]
 
 
 @pytest.fixture(scope="module")
