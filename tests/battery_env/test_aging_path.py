@@ -8,16 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import (
-    AgingPath,
-    LeastSquares,
-    PolicyEstimator,
-    TrajectoryDataset,
-    calibrate,
-    evaluate,
-    fit_life,
-    load_nasa_discharges,
-)
+from battery_env import AgingPath, LeastSquares, PolicyEstimator, TrajectoryDataset, calibrate, evaluate, fit_life
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SPREAD_SD, cell_with
 from battery_env.electrochemistry.equilibrium import with_equilibrium
@@ -27,6 +18,7 @@ from battery_env.lab.life import track_life
 from battery_env.lab.settings import Settings
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.records import Samples
+from battery_env.records.discharge import load_nasa_discharges
 from battery_env.records.model import RecordModel
 from battery_env.records.samples import Stream
 from battery_env.sensors import SensorErrors

@@ -19,18 +19,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env import NEW_CELL, Discharge, PolicyEstimator, Settings, initial_state, load_nasa_discharges, simulate
-from battery_env.estimates import last_estimate
-from battery_env.estimators import (
-    CellFit,
-    ClosedForm,
-    Estimate,
-    ExtendedKalmanFilter,
-    GreedyOneStep,
-    LeastSquares,
-    fit_cell,
-    soc_from_rest,
-)
+from battery_env import NEW_CELL, Discharge, PolicyEstimator, Settings, fit_cell, initial_state, load_nasa_discharges, simulate
+from battery_env.estimates import Estimate, last_estimate
+from battery_env.estimators import CellFit, ClosedForm, ExtendedKalmanFilter, GreedyOneStep, LeastSquares, soc_from_rest
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.lab.calibrate import Ahead, calibrated
 from battery_env.policies.pretrained import pretrained_ids

@@ -9,21 +9,11 @@ import numpy as np
 import pytest
 from numpy.polynomial import Legendre
 
-from battery_env import (
-    CellFit,
-    CellParameters,
-    ExtendedKalmanFilter,
-    LeastSquares,
-    OnnxPolicy,
-    PolicyEstimator,
-    fit_cell,
-    forecast,
-    load_nasa_discharges,
-)
+from battery_env import CellParameters, ExtendedKalmanFilter, LeastSquares, OnnxPolicy, PolicyEstimator, fit_cell, forecast
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
-from battery_env.estimators.cell_fit import RATE_PRIOR_SD, read_cell
+from battery_env.estimators.cell_fit import RATE_PRIOR_SD, CellFit, read_cell
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, JointFit
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
@@ -31,7 +21,7 @@ from battery_env.lab.settings import METHODS, Settings
 from battery_env.loads import constant as constant_load
 from battery_env.loads import in_steps
 from battery_env.policies.pretrained import pretrained_card
-from battery_env.records.discharge import Discharge
+from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)

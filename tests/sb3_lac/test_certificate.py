@@ -21,18 +21,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from benchmarks.control import ScaledController
-from sb3_lac import (
-    CertificateCallback,
-    FittedLyapunov,
-    GymnasiumVecEnv,
-    LyapunovCallback,
-    LyapunovFunction,
-    certify,
-    evaluate_lyapunov,
-    fit_lyapunov,
-)
+from sb3_lac import CertificateCallback, GymnasiumVecEnv, LyapunovCallback, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import LinearCostEnv, reference_controller
-from sb3_lac.stability import CriticLyapunov, fitting
+from sb3_lac.stability import CriticLyapunov, FittedLyapunov, LyapunovFunction, fitting
 from sb3_lac.stability.fitting import shortest_window, traced_returns
 from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, tightest_drift
 

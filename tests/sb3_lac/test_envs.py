@@ -13,15 +13,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from stable_baselines3.common.env_checker import check_env
 
-from sb3_lac.envs import (
-    CartPoleCostEnv,
-    CostEnv,
-    LinearCostEnv,
-    OscillatorEnv,
-    PendulumCostEnv,
-    QuadrotorCostEnv,
-    VehicleCostEnv,
-)
+from sb3_lac.envs import CartPoleCostEnv, LinearCostEnv, OscillatorEnv, PendulumCostEnv, QuadrotorCostEnv, VehicleCostEnv
+from sb3_lac.envs.base import CostEnv
 
 EPISODE_STEPS = {
     "CartPoleCost-v0": 250,
