@@ -191,11 +191,7 @@ class TestResampling:
         np.testing.assert_array_equal(resampled[50:], current_A[-1])
 
     @settings(max_examples=60)
-    @given(
-        gaps=st.lists(st.floats(0.05, 30.0), min_size=4, max_size=40),
-        dt_s=st.floats(0.1, 5.0),
-        seed=st.integers(0, 1000),
-    )
+    @given(gaps=st.lists(st.floats(0.05, 30.0), min_size=4, max_size=40), dt_s=st.floats(0.1, 5.0), seed=st.integers(0, 1000))
     def test_no_charge_is_lost(self, gaps, dt_s, seed):
         time_s = np.concatenate([[0.0], np.cumsum(gaps)])
         current_A = np.random.default_rng(seed).choice([0.0, 0.05, 1.9, 2.0, 2.1], size=len(time_s))

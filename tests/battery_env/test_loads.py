@@ -104,10 +104,7 @@ def test_a_recorded_load_is_switched_midway_between_the_samples():
         (lambda: RandomWalk(value_range=(2.0, 8000.0)), "got 8000.*unit of the load is power"),
         (lambda: RandomWalk(largest_step=-1.0), "largest_step must be a positive, finite number, got -1.0"),
         (lambda: recorded(load_nasa_discharges("B0005")[0], "energy"), "unit must be 'power'.* got 'energy'"),
-        (
-            lambda: recorded(load_nasa_discharges("B0005")[0], dt_s=1e5),
-            "dt_s must be at most the record's 3690.* got 100000",
-        ),
+        (lambda: recorded(load_nasa_discharges("B0005")[0], dt_s=1e5), "dt_s must be at most the record's 3690.* got 100000"),
     ],
 )
 def test_nonsense_is_refused(make, message):

@@ -614,8 +614,7 @@ class TestCountedByTheTester:
             assert found.sd_predicted_capacity_Ah > discharge.shown.uncounted_C / 3600.0
 
     @pytest.mark.parametrize(
-        ("ticks", "said"),
-        [(1.0, ""), (1e3, "milliseconds"), (1 / 60, "minutes"), (1 / 3600, "hours"), (1 / 86400, "days")],
+        ("ticks", "said"), [(1.0, ""), (1e3, "milliseconds"), (1 / 60, "minutes"), (1 / 3600, "hours"), (1 / 86400, "days")]
     )
     @pytest.mark.parametrize("sign", [1.0, -1.0])
     def test_it_tells_what_a_clock_without_a_unit_counts(self, ticks, said, sign):

@@ -288,11 +288,7 @@ CUT_SHORT = gzip.compress(b"time_s,voltage_V,current_A\n" + 200_000 * b"1,4.1,2\
         ("empty.csv", b"", "is empty"),
         ("header.csv", b"time_s,voltage_V,current_A\n", "no rows below the header"),
         ("headless.csv", b"0.0,4.19,0\n1.0,4.18,2\n", "no line with the names of the columns"),
-        (
-            "aborted.csv",
-            b"time_s,voltage_V,current_A\n0,4.2,0\n10,4.2,0\n20,4.0,2\n",
-            "needs 5 rows below the header, got 3",
-        ),
+        ("aborted.csv", b"time_s,voltage_V,current_A\n0,4.2,0\n10,4.2,0\n20,4.0,2\n", "needs 5 rows below the header, got 3"),
         ("text.txt", b"Dear all,\nplease find the data attached.\n", "no column for the time"),
         ("cut.csv.gz", CUT_SHORT, "damaged"),
         ("no.csv.gz", b"time_s,voltage_V,current_A\n", "damaged"),

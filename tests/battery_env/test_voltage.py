@@ -190,10 +190,7 @@ class TestTask:
             BatteryVoltageJoint(1, dataset=data.trimmed(0.05, 0.95))
 
 
-@pytest.mark.parametrize(
-    ("kind", "actions"),
-    [(BatteryVoltageJoint, 2), (BatteryVoltageQmax, 1), (BatteryVoltageRo, 1)],
-)
+@pytest.mark.parametrize(("kind", "actions"), [(BatteryVoltageJoint, 2), (BatteryVoltageQmax, 1), (BatteryVoltageRo, 1)])
 class TestEnvironments:
     def test_gymnasium_checks_pass(self, kind, actions, data):
         env = CalibrationEnv(kind, dataset=data)
