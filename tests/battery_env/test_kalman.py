@@ -113,7 +113,7 @@ class TestOnline:
     def test_updates_and_traces_agree(self):
         records = [measured(seed=n, q_mobile=q).part(0, 700) for n, q in enumerate((7000.0, 4000.0))]
         filter_ = ExtendedKalmanFilter()
-        batch, single = filter_.trace(records), OnlineEstimator.trace(filter_, records)
+        batch, single = filter_.trace(records), [OnlineEstimator.follow(filter_, record) for record in records]
         for one, other in zip(batch, single, strict=True):
             for name in (field.name for field in fields(EstimateTrace)):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
