@@ -27,25 +27,11 @@ import numpy as np
 import torch as th
 from stable_baselines3 import SAC, TD3
 
-from battery_env import (
-    ClosedForm,
-    ExtendedKalmanFilter,
-    GreedyOneStep,
-    LeastSquares,
-    PolicyEstimator,
-    RandomSensorErrors,
-    SensorErrors,
-    cramer_rao_bound,
-    evaluate,
-    fit_cell,
-    forecast,
-    load_nasa_discharges,
-    read_discharges,
-    simulate,
-    track_life,
-)
+from battery_env import PolicyEstimator, evaluate, forecast, load_nasa_discharges, read_discharges, simulate, track_life
 from battery_env.__main__ import main as battery_calibrate
+from battery_env.estimators import ClosedForm, ExtendedKalmanFilter, GreedyOneStep, LeastSquares, cramer_rao_bound, fit_cell
 from battery_env.loads import BlockBootstrap, Cycle, Load
+from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.data import standard_dataset
 from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import reference_controller

@@ -9,14 +9,11 @@ from matplotlib.figure import Figure
 
 import battery_env.files
 import sb3_lac.files
+from battery_env import ExtendedKalmanFilter, PolicyEstimator, TrajectoryDataset, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters
-from battery_env.estimators.kalman.filter import ExtendedKalmanFilter
 from battery_env.lab.running import read_load
 from battery_env.loads import constant
 from battery_env.plotting import save_figure
-from battery_env.policies.estimator import PolicyEstimator
-from battery_env.records.discharge import load_nasa_discharges
-from battery_env.trajectories import TrajectoryDataset
 from benchmarks.study import write_text
 from sb3_lac import LAC
 from sb3_lac.envs import reference_controller

@@ -8,16 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import (
-    AgingPath,
-    LeastSquares,
-    PolicyEstimator,
-    TrajectoryDataset,
-    calibrate,
-    evaluate,
-    fit_life,
-    load_nasa_discharges,
-)
+from battery_env import AgingPath, LeastSquares, PolicyEstimator, TrajectoryDataset, calibrate, evaluate, fit_life
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SPREAD_SD, cell_with
 from battery_env.electrochemistry.equilibrium import with_equilibrium
@@ -27,11 +18,13 @@ from battery_env.lab.life import track_life
 from battery_env.lab.settings import Settings
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.records import Samples
+from battery_env.records.discharge import load_nasa_discharges
 from battery_env.records.model import RecordModel
 from battery_env.records.samples import Stream
 from battery_env.sensors import SensorErrors
 from battery_env.tasks.voltage.pages import BatteryVoltageJoint, BatteryVoltageQmax
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES
+from tests.policies import Always
 
 AGES = 5
 LOAD = constant(2.0, "current")
@@ -298,21 +291,18 @@ class TestCalibrations:
             Settings(path=path)
 
 
-class Fit:
-    """A policy that leaves the estimate where the fit in its observation puts it."""
-
-    def predict(self, observation, deterministic=False):
-        return np.zeros((len(observation), 2), dtype=np.float32), None
+#: It leaves the estimate where the fit in its observation puts it.
+FIT = Always(0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
 def whole():
-    return [each.loaded_part(2.7) for each in load_nasa_discharges("B0005")[2::40]]
+    return [each.loaded_part(2.7) for each in load_nasa_discharges("B0005")[2::80]]
 
 
 @pytest.fixture(scope="module")
 def along(b0006):
-    return PolicyEstimator(Fit(), "BatteryVoltageJoint-v0", path=b0006)
+    return PolicyEstimator(FIT, "BatteryVoltageJoint-v0", path=b0006)
 
 
 class TestTask:
@@ -350,7 +340,7 @@ class TestTask:
 
     def test_intervals_along_the_path_hold(self, path):
         data = TrajectoryDataset.along(path, 60, [constant(1.5, "current"), LOAD], seed=7)
-        estimator = PolicyEstimator(Fit(), "BatteryVoltageJoint-v0", path=path)
+        estimator = PolicyEstimator(FIT, "BatteryVoltageJoint-v0", path=path)
         scores = evaluate(estimator, data, SensorErrors(0.002), seed=1)
         # of cells of the path itself the double of what the fit states holds nearly always
         assert scores["q_mobile_coverage_percent"].mean() > 97.0

@@ -19,26 +19,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
-from battery_env.estimates import last_estimate
-from battery_env.estimators import (
-    CellFit,
-    ClosedForm,
-    Estimate,
-    ExtendedKalmanFilter,
-    GreedyOneStep,
-    LeastSquares,
-    fit_cell,
-    soc_from_rest,
-)
+from battery_env import NEW_CELL, Discharge, PolicyEstimator, Settings, fit_cell, initial_state, load_nasa_discharges, simulate
+from battery_env.estimates import Estimate, last_estimate
+from battery_env.estimators import CellFit, ClosedForm, ExtendedKalmanFilter, GreedyOneStep, LeastSquares, soc_from_rest
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.lab.calibrate import Ahead, calibrated
-from battery_env.lab.command_line import NOT_SETTLED, REFUSED, SETTLED, calibrate
-from battery_env.lab.settings import Settings
-from battery_env.policies.estimator import PolicyEstimator
 from battery_env.policies.pretrained import pretrained_ids
 from battery_env.records import Samples, Stream
-from battery_env.records.discharge import Discharge, load_nasa_discharges
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES
 
 WRONG_SHARE = 0.05
@@ -495,41 +482,6 @@ def test_no_policy_of_new_cells_is_sure_of_a_real_one(cell):
     for discharge in discharges(cell)[::24]:
         estimate = estimator.estimate(discharge.loaded_part(2.7))
         assert not estimate.settled and estimate.reason and estimate.sd_q_mobile > 0.0
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_policy_says_the_same_of_a_stream_a_trace_and_the_whole_record(seed):
-    case = simulated(np.random.default_rng((5, seed)))
-    case = case.part(0, 60 * ((len(case.time_s) - 1) // 60) + 1)  # to the end of a decision
-    (found, estimate), *others = (outcome(case, PolicyEstimator.pretrained, path) for path in ("whole", "trace", "stream"))
-    assert found in ("right", "not settled")
-    for other_found, other in others:
-        assert other_found == found and other.reason == estimate.reason
-        for name in ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"):
-            assert getattr(other, name) == pytest.approx(getattr(estimate, name), rel=1e-6)
-
-
-@pytest.mark.parametrize("method", ["least-squares", "kalman", "policy"])
-@pytest.mark.parametrize("fault", ["none", "not full", "late start", "minutes", "flipped", "30 samples without current"])
-def test_nor_is_the_command_line(fault, method, tmp_path, capsys):
-    rng = np.random.default_rng(5)
-    start = initial_state(6000.0, soc=0.85 if fault == "not full" else 1.0)
-    record = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.4, initial=start)
-    voltage_V = record.voltage_V + rng.normal(0.0, 0.005, len(record.voltage_V))
-    case = Case(record.time_s, voltage_V, record.current_A, 6000.0, 0.15, recorded=False)
-    if fault in UNITS:
-        time, volts, amperes = UNITS[fault]
-        case = replace(case, time_s=time * case.time_s, voltage_V=volts * case.voltage_V, current_A=amperes * case.current_A)
-        options = ["--discharge-is-positive"]
-    else:
-        case, options = case if fault == "not full" else broken(case, fault, rng), []
-    columns = {"time_s": case.time_s, "voltage_V": case.voltage_V, "current_A": case.current_A}
-    pd.DataFrame(columns).to_csv(tmp_path / "record.csv", index=False)
-    status = calibrate([str(tmp_path / "record.csv"), "--method", method, *options])
-    # the policy of the command line knows cells that age as the bundled ones, and this is none
-    is_sure = fault == "none" and method != "policy"
-    assert status == SETTLED if is_sure else status in (REFUSED, NOT_SETTLED)
-    capsys.readouterr()
 
 
 #: What constants may be fitted to by mistake: discharges of B0005.

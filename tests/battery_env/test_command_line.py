@@ -13,18 +13,14 @@ import pandas as pd
 import pytest
 
 import battery_env
+from battery_env import Calibration, Discharge, LeastSquares, PolicyEstimator, Settings, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.ends import MEMORY_SHARE
 from battery_env.estimators.cell_fit import read_cell
-from battery_env.estimators.least_squares import LeastSquares
 from battery_env.lab import many
 from battery_env.lab.calibrate import calibrate as calibrated
 from battery_env.lab.command_line import main
-from battery_env.lab.report import Calibration
-from battery_env.lab.settings import Settings
 from battery_env.loads import constant
-from battery_env.policies.estimator import PolicyEstimator
-from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 
 @pytest.fixture(scope="module")
@@ -342,15 +338,6 @@ def test_what_is_drawn_after_the_cut_off_is_told(recorded, tmp_path, terminal):
     path = write(Discharge(time_s, *columns), tmp_path / "two.csv")
     row = terminal.row(path, "--discharge-is-positive")
     assert "Ah more are drawn after the cut-off at" in row["notes"] and row["capacity_Ah"] is None
-
-
-def test_a_load_that_ends_above_the_cut_off_is_told(recorded, tmp_path, terminal):
-    last_s, rest_s = recorded.time_s[-1], 10.0 + 10.0 * np.arange(30)
-    columns = (recorded.time_s, last_s + rest_s), (recorded.voltage_V, 3.2 + 0 * rest_s), (recorded.current_A, 0 * rest_s)
-    path = write(Discharge(*map(np.concatenate, columns)), tmp_path / "cell.csv")
-    said = "if the cell was discharged no further, state cut_off_V (--cut-off)"
-    assert said in terminal.row(path, "--cut-off", 2.0, "--discharge-is-positive")["notes"]
-    assert said not in (terminal.row(path, "--discharge-is-positive")["notes"] or "")
 
 
 def test_a_file_with_unknown_columns_lists_them_and_takes_them_from_the_command_line(recorded, tmp_path, terminal):

@@ -5,10 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from battery_env import PolicyEstimator, evaluate
-from battery_env.electrochemistry import NEW_CELL, simulate
+from battery_env import NEW_CELL, PolicyEstimator, RandomSensorErrors, SensorErrors, evaluate, simulate
 from battery_env.records import Samples
-from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.data import standard_dataset
 
 ENV_ID = "BatteryVoltageJoint-v0"

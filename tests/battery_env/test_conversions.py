@@ -3,17 +3,8 @@
 import numpy as np
 import pytest
 
-from battery_env import (
-    NEW_CELL,
-    Estimate,
-    LeastSquares,
-    RecordModel,
-    capacity_Ah,
-    dc_resistance_ohm,
-    initial_state,
-    load_nasa_discharges,
-    simulate,
-)
+from battery_env import NEW_CELL, Estimate, LeastSquares, RecordModel, capacity_Ah, dc_resistance_ohm, load_nasa_discharges
+from battery_env.electrochemistry import initial_state, simulate
 
 ESTIMATE = Estimate(6000.0, 0.15, 60.0, 0.01)
 

@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 
-from battery_env.electrochemistry import NEW_CELL, simulate
-from battery_env.estimates import Estimate
+from battery_env import NEW_CELL, Estimate, RecordModel, load_nasa_discharges, simulate
 from battery_env.estimators.cramer_rao import cramer_rao_bound, sensitivities
-from battery_env.records.discharge import load_nasa_discharges
-from battery_env.records.model import RecordModel
 
 NOISE_V = 0.010
-BOTH = ("q_mobile", "r_o")
 
 
 @pytest.fixture(scope="module")

@@ -54,18 +54,3 @@ def test_changing_loads_change_within_their_bounds(load):
     held = np.diff(np.flatnonzero(np.diff(values)))
     low, high = {"piecewise": (60, 140), "random_walk": (60, 60)}[load]
     assert held.min() >= low and held.max() <= high and values.min() >= 2.0 and values.max() <= 8.0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("capacity", "constant", "train"), r"parameters must be .* got \['capacity'\]"),
-        ((BOTH, "sine", "train"), "load must be one of .*'random_walk'.* got 'sine'"),
-        ((BOTH, "constant", "validation"), "split must be .* got 'validation'"),
-        ((BOTH, "constant", "train", 13.0), "dt must be .* got 13.0"),
-        ((BOTH, "constant", "train", 1.0, -0.1), r"mismatch .* 0 \.\. 0.5, got -0.1"),
-    ],
-)
-def test_nonsense_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        standard_dataset(*arguments)

@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 
-from battery_env.electrochemistry import simulate
-from battery_env.estimators.closed_form import ClosedForm
-from battery_env.estimators.cramer_rao import cramer_rao_bound
+from battery_env import ClosedForm, RandomSensorErrors, SensorErrors, TrajectoryDataset, cramer_rao_bound, simulate
 from battery_env.estimators.estimator import Estimate, EstimateTrace, Estimator
 from battery_env.evaluation import evaluate, over_seeds, summarize
 from battery_env.loads import RandomPiecewise, constant
-from battery_env.sensors import RandomSensorErrors, SensorErrors
-from battery_env.trajectories import TrajectoryDataset
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
+from battery_env import NEW_CELL, Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
 from battery_env.__main__ import calibrate, main
-from battery_env.electrochemistry import NEW_CELL
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.estimates import last_estimate
 from battery_env.estimators import ExtendedKalmanFilter
@@ -486,10 +485,7 @@ class TestCommand:
             (["running.csv", "--life", "lab", "--prior", "5000", "50"], "give one of them"),
             (["B0006:81", "--life", "B0005", "lab"], "discharges of B0005 and B0006: give those of the cell in progress"),
             (["lab"], "lab holds 2 files"),
-            (
-                ["running.csv", "--load", "lab/notes.txt"],
-                "columns time_s and either current_A or power_W, got moved",
-            ),
+            (["running.csv", "--load", "lab/notes.txt"], "columns time_s and either current_A or power_W, got moved"),
             (["running.csv", "--load", "late.csv"], "late.csv: start_s must be finite and increase from 0"),
             (["running.csv", "--load", "none.csv"], "none.csv"),
             (["running.csv", "--out", "running.csv"], "running.csv is a file"),

@@ -51,21 +51,6 @@ def test_the_defaults_disturb_nothing(discharges):
         task.advance(np.zeros((1, 1)))
 
 
-@pytest.mark.parametrize("wrong", [0, 1])
-def test_the_joint_task_shows_and_punishes_both_errors(discharges, wrong):
-    task = started(make(discharges, BatteryJoint))
-    assert task.parameters == ("q_mobile", "r_o") and task.observation().shape == (1, 29)
-    action = true_action(task)
-    assert task.advance(action) == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose([task.now["q_mobile_hat"], task.now["r_o_hat"]], [task.now["q_mobile"], task.now["r_o"]])
-    values = {"q_mobile": task.now["q_mobile"], "r_o": task.now["r_o"]}
-    name = task.parameters[wrong]
-    action = task.action_of({**values, name: 1.05 * values[name]})
-    cost = task.advance(action)
-    assert 0.02 < cost < 1.0
-    np.testing.assert_allclose({"q_mobile": task.now["q_mobile_hat"], "r_o": task.now["r_o_hat"]}[name], 1.05 * values[name])
-
-
 def test_resync_sets_the_model_to_the_measured_state(discharges):
     task = started(make(discharges, resync=3))
     for decision in range(1, 8):

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from battery_env import GreedyOneStep, TrajectoryDataset
 from battery_env.electrochemistry import QNS, VO, simulate, step
-from battery_env.estimators.greedy import GreedyOneStep
 from battery_env.loads import RandomPiecewise
-from battery_env.trajectories import TrajectoryDataset
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import LeastSquares, fit_cell, load_nasa_discharges, soc_from_rest
+from battery_env import Discharge, LeastSquares, RecordModel, fit_cell, load_nasa_discharges, soc_from_rest, track_life
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.lab.command_line import NOT_SETTLED, SETTLED, calibrate
-from battery_env.lab.life import track_life
 from battery_env.loads import constant
-from battery_env.records.discharge import Discharge
-from battery_env.records.model import RecordModel
 
 REST_S = 200
 
@@ -37,12 +34,6 @@ class TestStart:
         model = RecordModel(initial_soc=soc)
         for q_mobile in (4000.0, 7600.0):
             np.testing.assert_allclose(model.start(q_mobile), initial_state(q_mobile, soc=soc), rtol=1e-12, atol=1e-9)
-
-    def test_tangents_know_of_it(self):
-        model, load_A = RecordModel(initial_soc=0.6), np.full(600, 2.0)
-        _, by_q, _ = model.sensitivities(load_A, 6000.0, 0.15)
-        above, below = (model.sensitivities(load_A, 6000.0 + step, 0.15)[0] for step in (1.0, -1.0))
-        np.testing.assert_allclose(by_q, 0.5 * (above - below), rtol=1e-4, atol=1e-9)
 
 
 class TestRest:

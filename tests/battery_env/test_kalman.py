@@ -5,16 +5,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from battery_env.electrochemistry import NEW_CELL, simulate
+from battery_env import NEW_CELL, ExtendedKalmanFilter, SensorErrors, TrajectoryDataset, simulate
 from battery_env.estimates import EstimateTrace
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
 from battery_env.estimators.estimator import OnlineEstimator
-from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise
-from battery_env.records.discharge import load_nasa_discharges
-from battery_env.sensors import SensorErrors
-from battery_env.trajectories import TrajectoryDataset
 
 NOISE_V = 0.005
 
@@ -117,36 +113,8 @@ class TestOnline:
     def test_updates_and_traces_agree(self):
         records = [measured(seed=n, q_mobile=q).part(0, 700) for n, q in enumerate((7000.0, 4000.0))]
         filter_ = ExtendedKalmanFilter()
-        batch, single = filter_.trace(records), OnlineEstimator.trace(filter_, records)
+        batch, single = filter_.trace(records), [OnlineEstimator.follow(filter_, record) for record in records]
         for one, other in zip(batch, single, strict=True):
             for name in (field.name for field in fields(EstimateTrace)):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
         assert filter_.estimate(records[1]).q_mobile == batch[1].q_mobile[-1]
-
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            ({"mismatch_V": 0.05, "voltage_noise_V": 0.005}, "voltage_noise_V must be at least mismatch_V, 0.05 V, got 0.005"),
-            ({"prior_r_o_ohm": (0.1, 0.0)}, "prior of r_o"),
-        ],
-    )
-    def test_arguments_out_of_range_are_refused(self, arguments, message):
-        with pytest.raises(ValueError, match=message):
-            ExtendedKalmanFilter(**arguments)
-
-
-class TestRealCells:
-    def test_it_finds_the_charge_of_a_real_cell_over_its_life(self):
-        discharges = load_nasa_discharges("B0005")[::12]
-        records = [discharge.loaded_part(2.7) for discharge in discharges]
-        traces = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05).trace(records)
-        final = np.array([trace.q_mobile[-1] for trace in traces])
-        capacity_Ah = np.array([discharge.meta["capacity_Ah"] for discharge in discharges])
-        assert np.corrcoef(final, capacity_Ah)[0, 1] > 0.999
-        np.testing.assert_allclose(final / (3600.0 * capacity_Ah), 1.055, atol=0.03)
-        assert all(trace.settled[-1] for trace in traces)
-        # honest half-way, where the voltage determines little
-        for trace, q_mobile in zip(traces, final, strict=True):
-            middle = len(trace.time_s) // 2
-            assert abs(trace.q_mobile[middle] - q_mobile) < 2.0 * trace.sd_q_mobile[middle]
-            assert not trace.settled[middle]

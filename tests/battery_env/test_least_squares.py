@@ -5,14 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from battery_env import Discharge, ExtendedKalmanFilter, LeastSquares, cramer_rao_bound, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
-from battery_env.estimators.cramer_rao import cramer_rao_bound
-from battery_env.estimators.kalman import ExtendedKalmanFilter
-from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import Prior, Search
 from battery_env.records import Samples
-from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 
 def discharged(
@@ -272,21 +269,27 @@ class TestBadInput:
             kind(**arguments)
 
     @pytest.mark.parametrize(
-        ("arguments", "message"),
+        ("kind", "arguments", "message"),
         [
-            ({"initial": np.zeros(7)}, "initial must hold 8"),
-            ({"initial": initial_state(), "initial_soc": 0.8}, "initial is a whole state: give it or initial_soc, got both"),
-            ({"window_every_s": -1.0}, "window_every_s must be greater than 0"),
-            ({"nuisance": {"kn": 0.0}}, "nuisance kn must be a positive"),
-            ({"nuisance": {"kn": "0.2"}}, "nuisance kn must be a positive"),
-            ({"nuisance": {"knn": 0.2}}, r"nuisance constants are kn, kp, .* and offset_V, got 'knn'"),
-            ({"nuisance": ["kn"]}, "standard deviations by name"),
-            ({"nuisance": {"tDiffusion": 0.2}, "parameters": ["r_o"]}, "only beside q_mobile"),
+            (LeastSquares, {"initial": np.zeros(7)}, "initial must hold 8"),
+            (
+                LeastSquares,
+                {"initial": initial_state(), "initial_soc": 0.8},
+                "initial is a whole state: give it or initial_soc, got both",
+            ),
+            (LeastSquares, {"window_every_s": -1.0}, "window_every_s must be greater than 0"),
+            (LeastSquares, {"nuisance": {"kn": 0.0}}, "nuisance kn must be a positive"),
+            (LeastSquares, {"nuisance": {"kn": "0.2"}}, "nuisance kn must be a positive"),
+            (LeastSquares, {"nuisance": {"knn": 0.2}}, r"nuisance constants are kn, kp, .* and offset_V, got 'knn'"),
+            (LeastSquares, {"nuisance": ["kn"]}, "standard deviations by name"),
+            (LeastSquares, {"nuisance": {"tDiffusion": 0.2}, "parameters": ["r_o"]}, "only beside q_mobile"),
+            (ExtendedKalmanFilter, {"mismatch_V": 0.05, "voltage_noise_V": 0.005}, "at least mismatch_V, 0.05 V, got 0.005"),
+            (ExtendedKalmanFilter, {"prior_r_o_ohm": (0.1, 0.0)}, "prior of r_o"),
         ],
     )
-    def test_its_own_arguments_are_checked(self, arguments, message):
+    def test_its_own_arguments_are_checked(self, kind, arguments, message):
         with pytest.raises((TypeError, ValueError), match=message):
-            LeastSquares(**arguments)
+            kind(**arguments)
 
     def test_a_record_says_what_it_takes(self):
         with pytest.raises(ValueError, match=r"at least 5\d\d\d.* C, which is beyond the upper bound, 4000 C"):

@@ -6,10 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
-from battery_env.electrochemistry import NEW_CELL
+from battery_env import NEW_CELL, Discharge, load_nasa_discharges
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, RandomWalk, constant, recorded
 from battery_env.records import Samples
-from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 
 def piecewise(values, durations_s):
@@ -27,16 +26,6 @@ def test_a_segment_holds_from_its_start_to_the_next():
     load = piecewise([2.0, 8.0, 5.0], [60.0, 30.0, 10.0])
     np.testing.assert_array_equal(load([0.0, 59.9, 60.0, 89.0, 90.0, 1e6]), [2.0, 2.0, 8.0, 8.0, 5.0, 5.0])
     assert load(0.0) == 2.0 and constant(8.0)(np.arange(3.0)).tolist() == [8.0] * 3
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_random_piecewise_stays_in_its_ranges_and_follows_its_seed(seed):
-    family = RandomPiecewise(value_range=(2.0, 8.0), duration_range_s=(60.0, 140.0), total_s=1000.0)
-    load, again = family(np.random.default_rng(seed)), family(np.random.default_rng(seed))
-    np.testing.assert_array_equal(load.value, again.value)
-    assert (load.value >= 2.0).all() and (load.value <= 8.0).all()
-    assert (np.diff(load.start_s) >= 60.0).all() and (np.diff(load.start_s) <= 140.0).all()
-    assert load.start_s[-1] < 1000.0
 
 
 @pytest.mark.parametrize(
@@ -57,13 +46,18 @@ def test_the_mean_over_steps_draws_what_the_load_does(load, dt_s):
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 30.0))
-def test_a_random_walk_stays_in_its_bounds_and_follows_its_seed(seed, largest_step):
+def test_random_loads_stay_in_their_bounds_and_follow_their_seed(seed, largest_step):
+    steps = RandomPiecewise(value_range=(2.0, 8.0), duration_range_s=(60.0, 140.0), total_s=1000.0)
     walk = RandomWalk(value_range=(2.0, 8.0), largest_step=largest_step, segment_s=30.0, total_s=1000.0)
-    load, again = walk(np.random.default_rng(seed)), walk(np.random.default_rng(seed))
-    np.testing.assert_array_equal(load.value, again.value)
-    assert (load.value >= 2.0).all() and (load.value <= 8.0).all()
-    assert (np.abs(np.diff(load.value)) <= largest_step * (1.0 + 1e-9)).all()
-    np.testing.assert_array_equal(load.start_s, np.arange(0.0, 1000.0, 30.0))
+    for family in (steps, walk):
+        load, again = family(np.random.default_rng(seed)), family(np.random.default_rng(seed))
+        np.testing.assert_array_equal(load.value, again.value)
+        assert (load.value >= 2.0).all() and (load.value <= 8.0).all() and load.start_s[-1] < 1000.0
+        if family is walk:
+            assert (np.abs(np.diff(load.value)) <= largest_step * (1.0 + 1e-9)).all()
+            np.testing.assert_array_equal(load.start_s, np.arange(0.0, 1000.0, 30.0))
+        else:
+            assert (np.diff(load.start_s) >= 60.0).all() and (np.diff(load.start_s) <= 140.0).all()
 
 
 def test_a_random_walk_visits_all_values_alike_and_remembers():
@@ -110,10 +104,7 @@ def test_a_recorded_load_is_switched_midway_between_the_samples():
         (lambda: RandomWalk(value_range=(2.0, 8000.0)), "got 8000.*unit of the load is power"),
         (lambda: RandomWalk(largest_step=-1.0), "largest_step must be a positive, finite number, got -1.0"),
         (lambda: recorded(load_nasa_discharges("B0005")[0], "energy"), "unit must be 'power'.* got 'energy'"),
-        (
-            lambda: recorded(load_nasa_discharges("B0005")[0], dt_s=1e5),
-            "dt_s must be at most the record's 3690.* got 100000",
-        ),
+        (lambda: recorded(load_nasa_discharges("B0005")[0], dt_s=1e5), "dt_s must be at most the record's 3690.* got 100000"),
     ],
 )
 def test_nonsense_is_refused(make, message):

@@ -3,17 +3,15 @@
 import numpy as np
 import pytest
 
-from battery_env import PolicyEstimator, evaluate
+from battery_env import PolicyEstimator, SensorErrors, TrajectoryDataset, evaluate
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.cell import POLYNOMIAL_SIZE
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
-from battery_env.sensors import SensorErrors
 from battery_env.tasks.vector_env import CalibrationVectorEnv
 from battery_env.tasks.voltage.fit import Known, found_size, nuisance_step
 from battery_env.tasks.voltage.pages import BatteryVoltageJoint
 from battery_env.tasks.voltage.readings import Readings
-from battery_env.trajectories import TrajectoryDataset
 
 UNKNOWNS = ("q_mobile", "r_o", "offset_V", *UNCERTAIN_CONSTANTS)
 KNOWS_NOTHING = (1e6, 1e3, 1e3, *[100.0] * 4)

@@ -6,9 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env.electrochemistry import simulate
+from battery_env import RecordModel, SensorErrors, forecast, simulate
 from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, sensitivities
-from battery_env.lab.forecast import forecast
 from battery_env.plotting import (
     COLOUR_OF,
     COLOURS,
@@ -22,8 +21,6 @@ from battery_env.plotting import (
     plot_true_against_inferred,
 )
 from battery_env.records import Samples
-from battery_env.records.model import RecordModel
-from battery_env.sensors import SensorErrors
 
 
 @pytest.fixture
@@ -173,16 +170,6 @@ def test_a_name_has_one_colour_in_all_figures():
     (first, _), (second, _) = coloured(["least squares", "least squares, prior 2 %"])
     assert first == COLOUR_OF["least squares"] != second
     assert [colour for colour, _ in coloured(["replaced", 0.01])] == list(COLOURS[:2])
-
-
-def test_pulses_are_drawn_by_their_envelope():
-    pulses = simulate(np.tile(np.repeat([4.0, 0.0], 10), 300), 6000.0, 0.1, load_unit="current")
-    record = Samples(pulses.time_s, pulses.voltage_V, pulses.current_A)
-    voltage, current, _ = plot_discharge(record, {"model": RecordModel().forecast(record, Estimate(6000.0, 0.1))}).axes
-    for line in (voltage.lines[0], voltage.lines[1], current.lines[0]):
-        low, high = np.split(line.get_ydata(), np.flatnonzero(np.isnan(line.get_xdata())))
-        assert len(low) == len(high) - 1 < len(record.time_s) / 20 and (low <= high[1:]).all()
-    assert set(low[:-1]) == {0.0} and set(high[1:]) == {4.0}
 
 
 def test_a_discharge_in_progress_ends_in_a_band(record):

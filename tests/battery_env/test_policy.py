@@ -5,28 +5,13 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from battery_env import PolicyEstimator
-from battery_env.electrochemistry import NEW_CELL, CellParameters
-from battery_env.evaluation import evaluate
+from battery_env import NEW_CELL, CellParameters, PolicyEstimator, TrajectoryDataset, evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.voltage.aging import simulated_lives
 from battery_env.tasks.voltage.task import LARGEST_STEPS
-from battery_env.trajectories import TrajectoryDataset
-
-
-class Constant:
-    """A policy that always does the same, and remembers what it saw."""
-
-    def __init__(self, *action):
-        self.action = np.array(action)
-        self.seen = []
-
-    def predict(self, observation, deterministic=False):
-        assert deterministic
-        self.seen.append(observation)
-        return np.tile(self.action, (len(observation), 1)), None
+from tests.policies import Always
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +20,7 @@ def data(aged_both):
 
 
 def test_one_estimate_at_each_decision_of_each_discharge(data):
-    policy = Constant(-0.1, 0.1)
+    policy = Always(-0.1, 0.1)
     traces = PolicyEstimator(policy, "BatteryVoltageJoint-v0", decision_s=60.0).trace(data)
     for trace, trajectory in zip(traces, data, strict=True):
         readings = int(trajectory.time_s[-1] // 10)
@@ -47,7 +32,7 @@ def test_one_estimate_at_each_decision_of_each_discharge(data):
 
 
 def test_it_sees_what_the_sensors_show_and_nothing_more(data):
-    exact, noisy = Constant(0.0, 0.0), Constant(0.0, 0.0)
+    exact, noisy = Always(0.0, 0.0), Always(0.0, 0.0)
     evaluate(PolicyEstimator(exact, "BatteryVoltageJoint-v0"), data)
     scores = evaluate(PolicyEstimator(noisy, "BatteryVoltageJoint-v0"), data, SensorErrors(offset_V=0.05))
     shift = np.sinh(noisy.seen[0][:, 98].astype(np.float64)) - np.sinh(exact.seen[0][:, 98].astype(np.float64))
@@ -56,14 +41,14 @@ def test_it_sees_what_the_sensors_show_and_nothing_more(data):
 
 
 def test_what_is_not_searched_for_is_known(data):
-    traces = PolicyEstimator(Constant(-0.1), "BatteryVoltageRo-v0").trace(data)
+    traces = PolicyEstimator(Always(-0.1), "BatteryVoltageRo-v0").trace(data)
     for trace, q_mobile in zip(traces, data.q_mobile, strict=True):
         assert (trace.q_mobile == q_mobile).all() and trace.r_o[0] < NEW_CELL.r_o
 
 
 def test_a_life_is_followed_with_one_estimate():
     lives = simulated_lives(2, 3, seed=0)
-    policy = Constant(-0.1, 0.1)
+    policy = Always(-0.1, 0.1)
     estimator = PolicyEstimator(policy, "BatteryAging-v0", decision_s=300.0, cycles=3)
     traces = estimator.trace(lives)
     assert len(traces) == 6 and policy.seen[0].shape == (2, 104)
@@ -83,11 +68,11 @@ def test_a_life_is_followed_with_one_estimate():
 
 def test_bad_arguments_are_refused(data):
     with pytest.raises(ValueError, match=r"decision_s must be a positive, finite number, got 0\.0"):
-        PolicyEstimator(Constant(0.0), "BatteryVoltageRo-v0", decision_s=0.0)
+        PolicyEstimator(Always(0.0), "BatteryVoltageRo-v0", decision_s=0.0)
     with pytest.raises(ValueError, match="3 discharges are no whole number of lives of 20 cycles"):
-        PolicyEstimator(Constant(0.0, 0.0), "BatteryAging-v0").trace(data[:3])
+        PolicyEstimator(Always(0.0, 0.0), "BatteryAging-v0").trace(data[:3])
     with pytest.raises(ValueError, match="CartPole-v1 is no calibration environment"):
-        PolicyEstimator(Constant(0.0), "CartPole-v1")
+        PolicyEstimator(Always(0.0), "CartPole-v1")
 
 
 class Last:

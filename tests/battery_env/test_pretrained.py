@@ -11,12 +11,10 @@ from itertools import product
 import numpy as np
 import pytest
 
-from battery_env import AgingPath, LeastSquares, PolicyEstimator, evaluate, load_nasa_discharges
-from battery_env.electrochemistry import NEW_CELL
+from battery_env import NEW_CELL, AgingPath, LeastSquares, PolicyEstimator, SensorErrors, evaluate, load_nasa_discharges
 from battery_env.estimates import last_estimate
 from battery_env.policies.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_policy
 from battery_env.records.discharge import BUNDLED_CELLS
-from battery_env.sensors import SensorErrors
 from battery_env.tasks.data import standard_dataset
 
 FOLDER = files("battery_env.policies.pretrained_policies")
@@ -94,15 +92,6 @@ def test_without_onnxruntime_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ImportError, match=r"needs pip install 'battery_env\[onnx\]'"):
         PolicyEstimator.pretrained()
-
-
-def test_a_stream_does_not_go_on_with_another_policy(tmp_path):
-    stream = PolicyEstimator.pretrained()
-    stream.update(4.19, 2.0, 0.0)
-    saved = stream.save(tmp_path / "state.npz")
-    PolicyEstimator.pretrained().load(saved)
-    with pytest.raises(ValueError, match="is of an estimator with "):
-        PolicyEstimator.pretrained(recorded=True).load(saved)
 
 
 class TestFiles:

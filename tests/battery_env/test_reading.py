@@ -6,7 +6,6 @@ import gzip
 import importlib.util
 import sys
 import time
-import types
 import warnings
 
 import numpy as np
@@ -566,24 +565,6 @@ def test_a_sign_that_was_told_from_the_data_is_not_advised_to_be_another(stated,
     assert ("--discharge-is-negative" in str(caught.value)) == advised
 
 
-def test_a_sign_that_was_stated_is_not_advised_again():
-    with pytest.raises(ValueError, match="--discharge-is-negative"):
-        read_discharges(TABLE.iloc[1:], discharge_is_negative=False)
-
-
-def test_a_dependency_of_a_reader_that_is_missing_is_named_and_its_warnings_are_not_passed_on(tmp_path, monkeypatch):
-    neware = types.ModuleType("NewareNDA")
-
-    def loud(path, log_level):
-        warnings.warn("this will change in pandas 4", FutureWarning, stacklevel=2)
-        return TABLE
-
-    neware.read = loud
-    monkeypatch.setitem(sys.modules, "NewareNDA", neware)
-    (tmp_path / "cell.ndax").write_bytes(b"x")
-    same(read(tmp_path / "cell.ndax"))
-
-
 class TestCountedByTheTester:
     COUNTED = np.append(0.0, np.cumsum(np.maximum(-TABLE["current"], 0.0).to_numpy()[:-1] * np.diff(TABLE["time"]))) / 3600.0
 
@@ -633,8 +614,7 @@ class TestCountedByTheTester:
             assert found.sd_predicted_capacity_Ah > discharge.shown.uncounted_C / 3600.0
 
     @pytest.mark.parametrize(
-        ("ticks", "said"),
-        [(1.0, ""), (1e3, "milliseconds"), (1 / 60, "minutes"), (1 / 3600, "hours"), (1 / 86400, "days")],
+        ("ticks", "said"), [(1.0, ""), (1e3, "milliseconds"), (1 / 60, "minutes"), (1 / 3600, "hours"), (1 / 86400, "days")]
     )
     @pytest.mark.parametrize("sign", [1.0, -1.0])
     def test_it_tells_what_a_clock_without_a_unit_counts(self, ticks, said, sign):

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
+from battery_env import TrajectoryDataset
 from battery_env.electrochemistry import NEW_CELL, QNB, QNS, VO, simulate
 from battery_env.loads import RandomPiecewise
-from battery_env.records.discharge import load_nasa_discharges
 from battery_env.tasks.voltage.readings import SHOWN, Readings, explain
-from battery_env.trajectories import TrajectoryDataset
 
 
 @pytest.fixture(scope="module")
@@ -80,29 +79,6 @@ def test_the_misfit_grows_with_every_coulomb_below_what_was_drawn(readings):
     assert np.isfinite(misfits_V).all()
     assert (np.diff(misfits_V, axis=0) > 0.0).all()
     assert np.median(misfits_V[-1]) > 0.1
-
-
-class TestAnotherCurrentSensor:
-
-    def test_gain_and_offset_are_those_of_a_record_with_that_current(self, aged_both, readings):
-        trajectory = aged_both[0]
-        n_steps = 10 * readings.count[0]
-        gains = np.random.default_rng(0).uniform(0.9, 1.1, readings.count[0])
-        current_A = trajectory.current_A.copy()
-        current_A[:n_steps] = np.repeat(gains, 10) * current_A[:n_steps] + 0.05
-        again = Readings.of([type(trajectory)(**{**trajectory.__dict__, "current_A": current_A})])
-        measured = readings.remeasured(0, gains, 0.05)
-        for array, name in zip(measured, ("current_A", "moved_C", "ohmic_A"), strict=True):
-            np.testing.assert_allclose(array, getattr(again, name), rtol=1e-9, atol=1e-6)
-
-
-def test_recorded_discharges_can_be_read():
-    discharges = [discharge.loaded_part(3.0) for discharge in load_nasa_discharges("B0005")[:2]]
-    readings = Readings.of(discharges)
-    assert np.isnan(readings.q_mobile).all()
-    for n, discharge in enumerate(discharges):
-        drawn_C = np.trapezoid(discharge.current_A, discharge.time_s)
-        assert readings.drawn_C[readings.part(n)][-1] == pytest.approx(drawn_C, rel=0.01)
 
 
 def test_other_intervals_and_time_steps():

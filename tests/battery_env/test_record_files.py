@@ -14,8 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from battery_env.electrochemistry import simulate
-from battery_env.lab.readers.discharges import read_discharge_csv, read_discharges
+from battery_env import read_discharge_csv, read_discharges, simulate
 
 # two samples at rest, a load of 2 A, and a rest
 TIME_S = np.concatenate([[0.0, 5.0], np.arange(10.0, 1810.0, 30.0), [1815.0, 1830.0]])
@@ -289,11 +288,7 @@ CUT_SHORT = gzip.compress(b"time_s,voltage_V,current_A\n" + 200_000 * b"1,4.1,2\
         ("empty.csv", b"", "is empty"),
         ("header.csv", b"time_s,voltage_V,current_A\n", "no rows below the header"),
         ("headless.csv", b"0.0,4.19,0\n1.0,4.18,2\n", "no line with the names of the columns"),
-        (
-            "aborted.csv",
-            b"time_s,voltage_V,current_A\n0,4.2,0\n10,4.2,0\n20,4.0,2\n",
-            "needs 5 rows below the header, got 3",
-        ),
+        ("aborted.csv", b"time_s,voltage_V,current_A\n0,4.2,0\n10,4.2,0\n20,4.0,2\n", "needs 5 rows below the header, got 3"),
         ("text.txt", b"Dear all,\nplease find the data attached.\n", "no column for the time"),
         ("cut.csv.gz", CUT_SHORT, "damaged"),
         ("no.csv.gz", b"time_s,voltage_V,current_A\n", "damaged"),
@@ -382,7 +377,12 @@ def test_binary_files_of_neware_and_biologic_go_by_the_names_of_its_readers(tmp_
     neware, biologic = types.ModuleType("NewareNDA"), types.ModuleType("galvani.BioLogic")
     table = pd.DataFrame(named("Time", "Voltage", "Current(mA)", "T1", (1.0, 1.0, -1e3)) | {"Cycle": 1})
     table = table.assign(Step=np.where(LOADED, 2, 1), Status=np.where(LOADED, "CC_DChg", "Rest")).drop(columns="T1")
-    neware.read = lambda path, log_level: table.assign(Timestamp=pd.Timestamp("2026-02-28"))
+
+    def read(path, log_level):
+        warnings.warn("this will change in pandas 4", FutureWarning, stacklevel=2)  # which is no matter of who reads a record
+        return table.assign(Timestamp=pd.Timestamp("2026-02-28"))
+
+    neware.read = read
     records = np.rec.fromarrays([TIME_S, -1e3 * CURRENT_A, VOLTAGE_V], names="time/s,I/mA,Ewe/V")
     biologic.MPRfile = lambda stream: types.SimpleNamespace(data=records)
     monkeypatch.setitem(sys.modules, "NewareNDA", neware)

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from battery_env import Estimate, RecordModel
 from battery_env.electrochemistry import NEW_CELL, QNS, QPS, initial_state, simulate
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
-from battery_env.estimates import Estimate
 from battery_env.loads import constant
-from battery_env.records.model import RecordModel
 
 CURRENT_A = np.repeat(np.random.default_rng(0).uniform(0.5, 2.5, 40), 75)
 RECORD = simulate(2.0, 6000.0, 0.15, load_unit="current")
@@ -102,14 +101,6 @@ def test_nothing_is_known_after_the_model_cell_is_empty():
         assert np.isfinite(column[:n]).all() and np.isnan(column[n:]).all()
 
 
-def test_charges_of_the_start_move_along_with_q_mobile():
-    model = RecordModel(initial=PARTLY_DISCHARGED)
-    np.testing.assert_allclose(model.start(6000.0), PARTLY_DISCHARGED, rtol=1e-12)
-    np.testing.assert_allclose(
-        model.start(7000.0) - model.start(6000.0), initial_state(1000.0) * (np.arange(8) > 0), atol=1e-9
-    )
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -141,11 +132,6 @@ class TestForecast:
         assert forecast.voltage_V[-1] == 3.0 and (np.diff(forecast.time_s) > 0.0).all()
         expected_s = RecordModel().forecast(RECORD.part(0, 900), TRUTH).eod_time_s + 1000.0
         assert forecast.eod_time_s == pytest.approx(expected_s)
-
-    def test_it_is_unknown_when_the_load_is_off(self):
-        current_A = np.where(np.arange(600) < 300, 2.0, 0.0)
-        record = simulate(current_A, 6000.0, 0.15, load_unit="current")
-        assert np.isnan(RecordModel().forecast(record, Estimate(6000.0, 0.15)).eod_time_s)
 
     def test_it_is_unknown_under_the_current_that_a_sensor_shows_at_rest(self):
         for current_A in (1e-9, 1e-3):  # steps down to the cut-off would not fit in memory, or take minutes

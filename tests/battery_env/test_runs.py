@@ -20,14 +20,11 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from battery_env import files
+from battery_env import Settings, files, load_nasa_discharges, read_discharges
 from battery_env.files import locked
 from battery_env.lab import many
 from battery_env.lab.command_line import main
-from battery_env.lab.readers.discharges import read_discharges
-from battery_env.lab.settings import Settings
 from battery_env.lab.workers import attempt, in_order, workers
-from battery_env.records.discharge import load_nasa_discharges
 from tests.faults import a_full_disk, squared_unless_it_ends_its_process
 
 ROWS = 12

@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
+from battery_env import NEW_CELL, Discharge, RecordModel, initial_state, load_nasa_discharges, simulate
 from battery_env.estimators import CellFit, Estimate, ExtendedKalmanFilter, LeastSquares, fit_cell
 from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis, is_only_imprecise
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.records import expected_current
-from battery_env.records.discharge import Discharge, load_nasa_discharges
-from battery_env.records.model import RecordModel
 
 CALIBRATORS = {
     "least squares": lambda **more: LeastSquares(**{"thermal": True, "mismatch_V": 0.05, **more}),

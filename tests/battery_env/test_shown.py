@@ -6,14 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import calibrate, load_nasa_discharges, read_discharges
+from battery_env import Discharge, Settings, calibrate, load_nasa_discharges, read_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators.diagnosis.gaps import doubtful_C
 from battery_env.estimators.diagnosis.samples import fault_condition, unseen_C, watched
 from battery_env.estimators.estimator import OnlineEstimator
-from battery_env.lab.settings import Settings
 from battery_env.records import ChargeBefore, Samples, Shown, Stream
-from battery_env.records.discharge import Discharge
 from battery_env.records.switches import switched_sd_C
 
 METHODS = ("least-squares", "kalman")
@@ -158,17 +156,17 @@ class TestCharge:
         left_C = found.q_mobile_C * (1.0 / soc - 1.0)
         assert found.sd_q_mobile_C == pytest.approx(np.hypot(alone.sd_q_mobile_C, left_C), rel=0.3)
 
-    def test_one_that_tapered_off_too_low_is_none_of_these_constants(self):
-        (found,) = calibrate(cycled(4.1, 0.05, soc=0.92))
-        assert not found.settled and "ended at 4.10 V" in found.reason
-
-    def test_a_rest_of_a_minute_tells_more_than_the_charge(self):
-        (found,) = calibrate(cycled(4.25, 3.0, rest_rows=100))
-        assert found.settled
-
-    def test_another_charge_that_is_stated_counts_more(self):
-        (found,) = calibrate(cycled(4.1, 3.0, 100, soc=0.9), initial_soc=0.9)
-        assert found.settled and is_right(found)
+    @pytest.mark.parametrize(
+        ("table", "stated", "reason"),
+        [
+            (cycled(4.1, 0.05, soc=0.92), {}, "ended at 4.10 V"),  # too low for these constants
+            (cycled(4.25, 3.0, rest_rows=100), {}, ""),  # a rest of a minute
+            (cycled(4.1, 3.0, 100, soc=0.9), {"initial_soc": 0.9}, ""),
+        ],
+    )
+    def test_a_rest_or_what_is_stated_tells_more_than_a_charge(self, table, stated, reason):
+        (found,) = calibrate(table, **stated)
+        assert found.settled == (not reason) and reason in found.reason and is_right(found)
 
     @pytest.mark.parametrize(
         ("share", "tapered"), [(0.0999, True), (0.1003, True), (0.104, True), (0.11, False), (0.2, False)]
@@ -221,7 +219,7 @@ class TestCutOff:
     def test_a_load_that_was_switched_off_is_over_and_has_the_method_of_a_whole_one(self):
         off = np.arange(len(REAL.time_s)) > 200
         record = replace(REAL, current_A=np.where(off, 0.0, REAL.current_A), voltage_V=np.where(off, 3.7, REAL.voltage_V))
-        with pytest.warns(UserWarning, match="the load ends at"):
+        with pytest.warns(UserWarning, match=r"the load ends at .* no further, state cut_off_V \(--cut-off\)"):
             assert calibrate(record).method == "least-squares"
 
 

@@ -70,20 +70,6 @@ def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, op
             step[3][:] = False  # what was returned is the caller's
 
 
-def test_the_mode_is_gymnasiums_default_and_its_reset_step_ignores_the_action(discharges):
-    episodes = []
-    for action in (-1.0, 1.0):
-        batch = gym.make_vec("BatteryQmax-v0", num_envs=2, dataset=discharges, episode_steps=2)
-        assert batch.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-        batch.reset(seed=0)
-        batch.step(np.zeros((2, 1)))
-        assert batch.step(np.zeros((2, 1)))[3].all()
-        observation, reward, _, truncated, info = batch.step(np.full((2, 1), action))
-        assert not truncated.any() and not reward.any() and not info["cost"].any()
-        episodes.append(observation)
-    np.testing.assert_array_equal(*episodes)
-
-
 def test_without_autoreset_the_caller_says_which_cells_start(discharges):
     batch = gym.make_vec("BatteryQmax-v0", num_envs=3, autoreset_mode="Disabled", dataset=discharges, episode_steps=3)
     task = batch.unwrapped.task
@@ -138,6 +124,7 @@ def test_nonsense_is_refused(discharges):
 
 def test_every_task_reports_what_info_promises(discharges):
     batch = gym.make_vec("BatteryQmax-v0", num_envs=2, dataset=discharges)
+    assert batch.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP  # as of Gymnasium
     _, info = batch.reset(seed=0)
     names = {"cost", *CalibrationTask.REPORTED}
     assert set(info) == names | {f"_{name}" for name in names}

@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from battery_env.electrochemistry import NEW_CELL
+from battery_env import NEW_CELL, Discharge, RandomSensorErrors, TrajectoryDataset, load_nasa_discharges
 from battery_env.loads import RandomPiecewise
-from battery_env.records.discharge import Discharge, load_nasa_discharges
-from battery_env.sensors import RandomSensorErrors
 from battery_env.tasks.env import CalibrationEnv
 from battery_env.tasks.full_state.pages import BatteryQmax
 from battery_env.tasks.voltage.aging import BatteryAging
 from battery_env.tasks.voltage.pages import BatteryVoltageJoint, BatteryVoltageQmax, BatteryVoltageRo
 from battery_env.tasks.voltage.readings import Readings
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES, LARGEST_STEPS
-from battery_env.trajectories import TrajectoryDataset
 
 BOTH = ("q_mobile", "r_o")
 LOW, HIGH = np.array([ESTIMATE_RANGES[name] for name in BOTH]).T
@@ -193,10 +190,7 @@ class TestTask:
             BatteryVoltageJoint(1, dataset=data.trimmed(0.05, 0.95))
 
 
-@pytest.mark.parametrize(
-    ("kind", "actions"),
-    [(BatteryVoltageJoint, 2), (BatteryVoltageQmax, 1), (BatteryVoltageRo, 1)],
-)
+@pytest.mark.parametrize(("kind", "actions"), [(BatteryVoltageJoint, 2), (BatteryVoltageQmax, 1), (BatteryVoltageRo, 1)])
 class TestEnvironments:
     def test_gymnasium_checks_pass(self, kind, actions, data):
         env = CalibrationEnv(kind, dataset=data)

@@ -9,9 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import PolicyEstimator, evaluate
-from battery_env.electrochemistry import NEW_CELL, simulate, step, voltage
-from battery_env.sensors import SensorErrors
+from battery_env import NEW_CELL, PolicyEstimator, SensorErrors, evaluate, simulate, step, voltage
 from battery_env.tasks.data import standard_dataset
 from benchmarks import calibrators
 from benchmarks.calibrators import COMPARISONS, Condition, Follow

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import PolicyEstimator, TrajectoryDataset
-from battery_env.records.discharge import load_nasa_discharges
+from battery_env import PolicyEstimator, TrajectoryDataset, load_nasa_discharges
 from benchmarks import cells
 from benchmarks.calibrators import ENV_ID, Follow
+from tests.policies import Always
 
 
 def configuration(file):
@@ -87,15 +87,7 @@ class TestOwnCell:
             assert whole["q_mobile_C"] == expected.estimate(records[0].loaded_part(2.7)).q_mobile
 
     def test_policies_act_together_by_their_mean(self):
-        class Constant:
-            def __init__(self, action):
-                self.action = action
-
-            def predict(self, observation, /, *, deterministic=False):
-                assert deterministic
-                return np.tile(self.action, (len(observation), 1)), None
-
-        together = cells.Together([Constant([0.2, -0.4]), Constant([0.4, 0.0])])
+        together = cells.Together([Always(0.2, -0.4), Always(0.4, 0.0)])
         np.testing.assert_allclose(together.predict(np.zeros((3, 5)), deterministic=True)[0], [[0.3, -0.2]] * 3)
 
 

@@ -22,13 +22,9 @@ def call(command, *arguments):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_says_how_the_command_is_called(command, capsys):
+def test_help_says_how_the_command_is_called_and_an_argument_that_there_is_not_is_refused(command, capsys):
     assert call(command, "--help") == 0
     assert f"usage: python -m benchmarks.{command}" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_an_argument_that_there_is_not_is_refused(command, capsys):
     assert call(command, "--no-such-option") == 2
     assert f"python -m benchmarks.{command}: error: " in capsys.readouterr().err
 

@@ -15,8 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 
-from battery_env.estimators.closed_form import ClosedForm
-from battery_env.evaluation import evaluate
+from battery_env import ClosedForm, evaluate
 from benchmarks import compare, contests
 from benchmarks.training import Recipe
 
@@ -304,6 +303,9 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
     ("wrong", "message"),
     [
         (["--algos", "lack"], "lack is no algorithm of the RL Zoo; choose from"),
+        (["--algos", "no_such_module:Mine"], "No module named 'no_such_module'"),
+        (["--algos", "benchmarks.training:Mine"], "has no attribute 'Mine'"),
+        (["--algos", "benchmarks.training:Recipe"], "must be a subclass of Stable-Baselines3's BaseAlgorithm"),
         (["--algos", "dqn", "--defaults"], "dqn on BatteryRo-v0: The algorithm only supports"),
         (["--algos", "ppo_lstm", "--defaults"], "policies with a memory cannot be scored here"),
         (["--algos", "tqc"], "tqc.yml"),

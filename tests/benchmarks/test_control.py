@@ -17,6 +17,7 @@ from docs.environment_pages import DOCS, environment_page
 from sb3_lac import LAC
 from sb3_lac.envs import LinearCostEnv
 from sb3_lac.stability import fitting
+from tests.policies import Always
 
 IDS = list(control.DISTURBANCES)
 
@@ -39,20 +40,8 @@ class CountdownEnv(gym.Env):
         return observation, 0.0, self.dies and self.n_steps == 3, self.n_steps == 5, info
 
 
-class RecordingPolicy:
-    """Always the same action; keeps what it was shown."""
-
-    def __init__(self, action):
-        self.action, self.seen = action, []
-
-    def predict(self, observations, deterministic):
-        assert deterministic
-        self.seen.append(np.array(observations))
-        return np.full((len(observations), 1), self.action, np.float32), None
-
-
 def test_costs_lengths_and_deaths_are_those_of_each_episode():
-    policy = RecordingPolicy(0.0)
+    policy = Always(0.0)
     outcome = control.roll_out(policy, CountdownEnv, 4)
     expected = {"cost": [3.0, 2.0] * 2, "length": [5, 3] * 2, "error_at_start": [10.0] * 4, "error": [5.0, 7.0] * 2}
     pd.testing.assert_frame_equal(outcome, pd.DataFrame(expected | {"died": [False, True] * 2}))
@@ -61,7 +50,7 @@ def test_costs_lengths_and_deaths_are_those_of_each_episode():
 
 
 def test_each_policy_has_the_same_starts():
-    left, right = RecordingPolicy(-1.0), RecordingPolicy(1.0)
+    left, right = Always(-1.0), Always(1.0)
     for policy in (left, right):
         control.roll_out(policy, lambda: gym.make("CartPoleCost-v0"), 3)
     np.testing.assert_array_equal(left.seen[0], right.seen[0])

@@ -12,6 +12,7 @@ from battery_env.trajectories import TrajectoryDataset
 from benchmarks import direct_mapping
 from benchmarks.direct_mapping import DirectMapping, draw_pairs
 from benchmarks.training import Recipe
+from tests.policies import Always
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -98,11 +99,7 @@ class TestDirectMapping:
 
 
 def test_the_study_compares_all_on_each_division(tmp_path, monkeypatch, capsys):
-    class Middle:
-        def predict(self, observation, deterministic=False):
-            return np.zeros((len(observation), 1)), None
-
-    monkeypatch.setattr(direct_mapping, "train_or_load", lambda *arguments: Middle())
+    monkeypatch.setattr(direct_mapping, "train_or_load", lambda *arguments: Always(0.0))
     monkeypatch.setattr(direct_mapping, "TEST_DISCHARGES", 4)
     command = ["--pairs", "64", "--epochs", "1", "--seeds", "0", "1", "--updates", "10"]
     direct_mapping.main([*command, "--out", str(tmp_path)])

@@ -4,8 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import Discharge, simulate
-from battery_env.electrochemistry import NEW_CELL
+from battery_env import NEW_CELL, Discharge, simulate
 from benchmarks import pybamm_cells
 from benchmarks.pybamm_cells import FIT, LIFE, SHARES, SimulatedLife, varies
 

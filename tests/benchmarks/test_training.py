@@ -248,20 +248,6 @@ def test_all_files_of_a_package_are_part_of_the_recipe(tmp_path, monkeypatch):
     assert training.Recipe.of("own_package_a:Mine", "LinearCost-v0", 0, 150, defaults=True).digest != before.digest
 
 
-@pytest.mark.parametrize(
-    ("algo", "message"),
-    [
-        ("lack", "lack is no algorithm of the RL Zoo; choose from"),
-        ("no_such_module:Mine", "No module named 'no_such_module'"),
-        ("benchmarks.training:Mine", "has no attribute 'Mine'"),
-        ("benchmarks.training:Recipe", "must be a subclass of Stable-Baselines3's BaseAlgorithm"),
-    ],
-)
-def test_what_is_no_algorithm_is_refused(algo, message):
-    with pytest.raises(ValueError, match=message):
-        training.Recipe.of(algo, ENV_ID, 0)
-
-
 def test_a_checkpoint_that_was_set_aside_is_put_back(tmp_path):
     folder, old = tmp_path / "checkpoint", tmp_path / "checkpoint.old"
     old.mkdir()

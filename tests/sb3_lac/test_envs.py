@@ -13,15 +13,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from stable_baselines3.common.env_checker import check_env
 
-from sb3_lac.envs import (
-    CartPoleCostEnv,
-    CostEnv,
-    LinearCostEnv,
-    OscillatorEnv,
-    PendulumCostEnv,
-    QuadrotorCostEnv,
-    VehicleCostEnv,
-)
+from sb3_lac.envs import CartPoleCostEnv, LinearCostEnv, OscillatorEnv, PendulumCostEnv, QuadrotorCostEnv, VehicleCostEnv
+from sb3_lac.envs.base import CostEnv
 
 EPISODE_STEPS = {
     "CartPoleCost-v0": 250,
@@ -372,15 +365,6 @@ def test_exact_value_is_the_mean_discounted_sum_of_costs():
     exact = env.cost_to_go(states[0], -states[0] @ gain.T, gain, GAMMA)
     for quarter in np.array_split(np.argsort(exact), 4):
         assert exact[quarter].mean() == pytest.approx(sums[quarter].mean(), rel=0.03)
-
-
-def test_largest_feasible_alpha3_is_that_of_roll_outs():
-    env = LinearCostEnv(noise_std=0.1)
-    gain = env.optimal_gain(GAMMA)
-    states, costs = linear_roll_outs(env, gain, n_episodes=5000, n_steps=100)
-    values = np.array([env.cost_to_go(s, -s @ gain.T, gain, GAMMA) for s in states])
-    expected = (values[:-1] - values[1:]).sum() / costs.sum()
-    assert env.largest_feasible_alpha3(gain, GAMMA) == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -23,33 +23,6 @@ class BatchNormDropoutExtractor(BatchNormExtractor):
         return nn.functional.dropout(super().forward(observations), training=self.training)
 
 
-def test_networks_learn_a_root_and_the_policy_shows_the_value(make_model):
-    model = make_model(n_collect=16)
-    critic = model.critic
-    obs, actions = th.randn(200, 2), th.rand(200, 2)
-    with th.no_grad():
-        for roots, net in zip(critic.outputs(obs, actions), critic.lyapunov_networks, strict=True):
-            net[-1].bias -= roots.mean()
-    roots = critic.outputs(obs, actions)
-    for of_critic, net in zip(roots, critic.lyapunov_networks, strict=True):
-        assert net[-1].out_features == 1
-        th.testing.assert_close(of_critic, net(th.cat([obs, actions], dim=1)))
-    assert not th.equal(roots[0], roots[1])
-    largest = th.maximum(*roots)
-    assert largest.min() < 0 < largest.max()
-    for value, root in zip(critic(obs, actions), roots, strict=True):
-        th.testing.assert_close(value, root.clamp(min=0) ** 4)
-    conservative = critic.lyapunov(obs, actions)
-    assert conservative.min() == 0
-    th.testing.assert_close(conservative, largest.clamp(min=0) ** 4)
-    critic.floor.fill_(2.0)
-    th.testing.assert_close(critic.lyapunov(obs, actions), (largest**3 * largest.abs() + 2).clamp(min=0))
-    # and it learns: the gradient reaches every parameter
-    before = [parameter.clone() for parameter in critic.parameters()]
-    model.train(gradient_steps=1, batch_size=8)
-    assert not any(th.equal(old, new) for old, new in zip(before, critic.parameters(), strict=True))
-
-
 def test_targets_start_as_copies_and_stay_in_eval_mode(make_model):
     model = make_model(n_collect=0, algorithm=PublishedLAC)
     for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
@@ -162,22 +135,10 @@ class Einsum(BaseFeaturesExtractor):
         return th.einsum("bi,oi->bo", observations, self.weight)
 
 
-class ChannelsLast(BaseFeaturesExtractor):
-    """A convolution of images whose last dimension is the colour."""
-
-    def __init__(self, observation_space):
-        super().__init__(observation_space, features_dim=16)
-        self.convolution = nn.Conv2d(3, 4, 3)
-
-    def forward(self, observations):
-        return self.convolution(observations.reshape(-1, 4, 4, 3).permute(0, 3, 1, 2)).flatten(1)
-
-
-@pytest.mark.parametrize("extractor", [Einsum, ChannelsLast])
-def test_fused_optimizer_updates_layers_of_any_memory_layout(make_model, make_env, train_metrics, extractor):
+def test_fused_optimizer_updates_layers_of_any_memory_layout(make_model, make_env, train_metrics):
     policies = []
     for fused in (True, False):
-        policy_kwargs = {"features_extractor_class": extractor, "optimizer_kwargs": {"fused": fused}}
+        policy_kwargs = {"features_extractor_class": Einsum, "optimizer_kwargs": {"fused": fused}}
         model = make_model(make_env(n_dim=48), policy_kwargs=policy_kwargs, learning_rate=1e-2)
         train_metrics(model, gradient_steps=2)
         policies.append(model.policy)

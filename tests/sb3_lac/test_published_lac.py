@@ -21,6 +21,10 @@ from tests.sb3_lac.equations import mlp, policy_sample
 GAMMA, TAU, ALPHA3 = 0.9, 0.05, 0.3
 RATES = {"actor": 1e-2, "critic": 3e-2}
 LAMBDA_RATE = 2e-2
+SETTINGS = {"gamma": GAMMA, "tau": TAU, "alpha3": ALPHA3, "ent_coef": "auto_0.7", "lambda_init": 0.5}
+SETTINGS |= {"learning_rate": RATES["actor"], "critic_learning_rate": RATES["critic"], "lambda_learning_rate": LAMBDA_RATE}
+# With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
+SETTINGS |= {"policy_kwargs": {"net_arch": None, "activation_fn": th.nn.ReLU, "optimizer_class": th.optim.SGD}}
 
 
 class ShortEpisodes(gym.Wrapper):
@@ -44,24 +48,8 @@ def lyapunov(weights, obs, actions):
 @pytest.mark.parametrize("horizon", [None, 5])
 @pytest.mark.parametrize("make_env", ["CartPoleCost-v0", "LinearCost-v0", lambda: ShortEpisodes(gym.make("LinearCost-v0"))])
 def test_step_is_that_of_the_equations(make_model, make_env, horizon):
-    model = make_model(
-        make_env if isinstance(make_env, str) else make_env(),
-        algorithm=PublishedLAC,
-        n_collect=120,
-        learning_starts=120,
-        gamma=GAMMA,
-        tau=TAU,
-        alpha3=ALPHA3,
-        horizon=horizon,
-        learning_rate=RATES["actor"],
-        critic_learning_rate=RATES["critic"],
-        lambda_learning_rate=LAMBDA_RATE,
-        ent_coef="auto_0.7",
-        lambda_init=0.5,
-        policy="MlpPolicy",
-        # With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
-        policy_kwargs={"net_arch": None, "activation_fn": th.nn.ReLU, "optimizer_class": th.optim.SGD},
-    )
+    env = make_env if isinstance(make_env, str) else make_env()
+    model = make_model(env, 120, algorithm=PublishedLAC, horizon=horizon, learning_starts=120, **SETTINGS)
     batch = model.replay_buffer.sample(32)
     model.replay_buffer.sample = lambda *args, **kwargs: batch
     obs, next_obs, actions, dones = batch.observations, batch.next_observations, batch.actions, batch.dones.flatten()
@@ -125,23 +113,6 @@ def test_step_is_that_of_the_equations(make_model, make_env, horizon):
     assert model.log_ent_coef.item() == pytest.approx(
         math.log(0.7) + RATES["actor"] * float(entropy_violation.sign()), rel=1e-4
     )
-
-
-def test_defaults_are_those_of_the_paper_and_the_code():
-    model = PublishedLAC("MlpPolicy", "CartPoleCost-v0", device="cpu")
-    assert [layer.out_features for layer in model.critic.lyapunov_networks[0] if hasattr(layer, "out_features")] == [
-        64,
-        64,
-        16,
-    ]
-    assert len(model.critic.lyapunov_networks) == 1
-    assert [schedule(1) for schedule in (model.lr_schedule, model.critic_lr_schedule, model.lambda_lr_schedule)] == [
-        1e-4,
-        3e-4,
-        1e-4,
-    ]
-    assert (model.gamma, model.tau, model.alpha3, model.horizon) == (0.995, 0.005, 1.0, None)
-    assert model.log_ent_coef.exp().item() == pytest.approx(2.0)
 
 
 @settings(deadline=None, max_examples=40)

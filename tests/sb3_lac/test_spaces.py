@@ -10,7 +10,6 @@ from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_lac import LAC, PublishedLAC
 
@@ -100,14 +99,6 @@ def test_image_observations(make_model, n_channels):
     check_training(model, n_steps=15)
 
 
-def test_hindsight_experience_replay(make_model):
-    env = BitFlippingEnv(n_bits=3, continuous=True)
-    model = make_model(env, n_collect=0, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
-    check_training(model)
-    # Rewards of -1, and of 0 at the goal
-    assert model.largest_reward.item() == 0.0
-
-
 def test_rewards_computed_at_sampling_raise_the_bound(make_model):
     class PositiveReward(BitFlippingEnv):
         """Reward 0, and 1 at the goal, which relabelled transitions reach before the agent does."""
@@ -124,18 +115,6 @@ def test_rewards_computed_at_sampling_raise_the_bound(make_model):
     assert model.replay_buffer.rewards.max() <= 0.0
     check_training(model)
     assert model.largest_reward.item() == 1.0
-
-
-@pytest.mark.parametrize("norm_reward", [False, True])
-def test_vec_normalize(make_model, make_env, norm_reward):
-    env = VecNormalize(make_vec_env(lambda: make_env(offset=2.0), n_envs=2), norm_reward=norm_reward)
-    model = make_model(env, n_collect=0)
-    check_training(model)
-    assert 0 < model.largest_reward.item() <= 2.0001
-
-
-def test_n_step_returns(make_model, make_env):
-    check_training(make_model(make_env(offset=2.0), n_collect=0, n_steps=3))
 
 
 @pytest.mark.parametrize(

@@ -76,16 +76,6 @@ def costs_of(model, rewards):
     return model.costs(ReplayBufferSamples(None, None, None, None, th.tensor(rewards))).tolist()
 
 
-def test_costs_are_the_negated_rewards_unless_rewards_are_positive(make_model):
-    model = make_model(n_collect=0)
-    assert costs_of(model, [-3.0, -0.5]) == [3.0, 0.5]
-    assert model.largest_reward.item() == 0.0
-    assert costs_of(model, [-3.0, 2.0]) == [5.0, 0.0]
-    # The bound is remembered
-    assert costs_of(model, [-1.0, 1.0]) == [3.0, 1.0]
-    assert model.largest_reward.item() == 2.0
-
-
 def test_costs_of_normalized_rewards_are_not_negative_and_the_bound_follows_the_scale(make_model, make_env):
     env = VecNormalize(DummyVecEnv([lambda: make_env(offset=30.0)]))
     model = make_model(env)

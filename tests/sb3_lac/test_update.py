@@ -12,6 +12,9 @@ from tests.sb3_lac.equations import mlp, policy_sample
 
 GAMMA, TAU, LEARNING_RATE, LAMBDA_LEARNING_RATE, ALPHA3 = 0.9, 0.05, 1e-2, 2e-2, 0.3
 LAMBDA_MIN, LAMBDA_MAX = 0.1, 1.0
+SETTINGS = {"gamma": GAMMA, "tau": TAU, "alpha3": ALPHA3, "ent_coef": "auto_0.7", "lambda_init": 0.5}
+SETTINGS |= {"learning_rate": LEARNING_RATE, "lambda_learning_rate": LAMBDA_LEARNING_RATE}
+SETTINGS |= {"lambda_min": LAMBDA_MIN, "lambda_max": LAMBDA_MAX}
 
 
 def mean_action(weights, obs):
@@ -56,20 +59,9 @@ class ScalarAdam:
 
 @pytest.mark.parametrize(("n_critics", "bound"), [(1, 0.0), (2, 0.0), (1, 3.0), (2, 3.0)])
 def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics, bound):
-    model = make_model_without_env(
-        reward_bound=bound,
-        gamma=GAMMA,
-        tau=TAU,
-        learning_rate=LEARNING_RATE,
-        lambda_learning_rate=LAMBDA_LEARNING_RATE,
-        alpha3=ALPHA3,
-        lambda_init=0.5,
-        lambda_min=LAMBDA_MIN,
-        lambda_max=LAMBDA_MAX,
-        ent_coef="auto_0.7",
-        # With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
-        policy_kwargs={"optimizer_class": th.optim.SGD, "n_critics": n_critics},
-    )
+    # With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
+    policy_kwargs = {"optimizer_class": th.optim.SGD, "n_critics": n_critics}
+    model = make_model_without_env(reward_bound=bound, policy_kwargs=policy_kwargs, **SETTINGS)
     th.manual_seed(0)
     batch = ReplayBufferSamples(
         observations=th.randn(16, 2),
@@ -222,11 +214,7 @@ def test_no_gradient_step_changes_nothing(make_model, train_metrics):
 
 @pytest.mark.parametrize(
     ("algorithm", "kwargs"),
-    [
-        (LAC, {}),
-        (PublishedLAC, {"critic_learning_rate": 3e-3}),
-        (PublishedLAC, {"critic_learning_rate": 3e-3, "horizon": 5}),
-    ],
+    [(LAC, {}), (PublishedLAC, {"critic_learning_rate": 3e-3}), (PublishedLAC, {"critic_learning_rate": 3e-3, "horizon": 5})],
 )
 def test_it_learns_to_control(make_model, make_env, algorithm, kwargs):
     def mean_cost():

@@ -262,12 +262,6 @@ def test_algorithm_without_a_discount_is_told_none(workdir, stating):
     assert "gamma" not in hyperparameters_of(workdir, stating, "ars", {"default": {"policy": "LinearPolicy"}})
 
 
-def test_model_and_normalization_have_the_stated_discount(workdir, stating, set_up):
-    (workdir / "zoo_configs" / "lac.yml").write_text(yaml.dump({"default": {**SETTINGS, "gamma": 0.99}}))
-    model = set_up(manager_of(stating, workdir))
-    assert model.gamma == model.get_vec_normalize_env().gamma == 0.8
-
-
 def test_where_hyperparameters_are_from_is_printed(workdir, stating, capsys):
     def said(algo, env_id):
         config = str(find_config(algo, env_id))

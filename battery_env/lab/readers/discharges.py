@@ -294,7 +294,8 @@ def _charge_before(rows: pd.DataFrame, begin: int) -> ChargeBefore | None:
     charging_A = current_A[start:begin]
     if not (charging_A < -LEAST_LOAD_SHARE * np.abs(current_A).max()).any():
         return None
-    return ChargeBefore.of(*(rows[each].to_numpy()[start:begin] for each in ("time", "voltage")), charging_A)
+    time_s, voltage_V = (rows[each].to_numpy()[start:begin] for each in ("time", "voltage"))
+    return ChargeBefore.of(time_s, voltage_V, charging_A)
 
 
 def _load_on_s(rows: pd.DataFrame, stretch: slice) -> float | None:
