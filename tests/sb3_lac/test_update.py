@@ -57,6 +57,24 @@ class ScalarAdam:
         self.value -= learning_rate * m_hat / (math.sqrt(v_hat) + 1e-8)
 
 
+@pytest.mark.parametrize("next_value", [2.0, -2.0])
+def test_the_value_behind_each_sample_is_discounted_as_it_says_and_not_negative(
+    make_model, train_metrics, monkeypatch, next_value
+):
+    model = make_model(n_steps=3, gamma=0.5, n_collect=50)
+    batch = model.replay_buffer.sample(16)._replace(discounts=th.tensor([0.5, 0.25, 0.125, 0.5] * 4)[:, None])
+    monkeypatch.setattr(model.replay_buffer, "sample", lambda *args, **kwargs: batch)
+    monkeypatch.setattr(model.critic_target, "outputs", lambda *args: (th.zeros(16, 1),))
+    monkeypatch.setattr(model.critic_target, "value", lambda roots: roots + next_value)
+    roots = model.critic.outputs(batch.observations, batch.actions)
+    values = (1 - batch.dones) * batch.discounts * max(next_value, 0.0) - batch.rewards
+    model.critic.floor.copy_(floor := (1 - model.tau) * model.critic.floor + model.tau * values.min())
+    targets = model.critic.root(values)
+    model.critic.floor.copy_((floor - model.tau * values.min()) / (1 - model.tau))
+    expected = 0.5 * sum(((root - targets) ** 2).mean() for root in roots)
+    assert train_metrics(model)["critic_loss"] == pytest.approx(expected.item(), rel=1e-4)
+
+
 @pytest.mark.parametrize(("n_critics", "bound"), [(1, 0.0), (2, 0.0), (1, 3.0), (2, 3.0)])
 def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics, bound):
     # With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
