@@ -210,7 +210,8 @@ class Discharge:
             raise ValueError(f"cut_off_V must be a voltage in V, got {cut_off_V!r}")
         first, last = self._loaded
         below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V) + first
-        for end in self._ends_of_loads(first, int(below[0]) if len(below) else last):
+        # a sample later the voltage may be that of this load still
+        for end in self._ends_of_loads(first, int(below[0]) - 2 if len(below) else last):
             if self._ends_at(cut_off_V, end):
                 return end
         if not len(below):
