@@ -264,8 +264,24 @@ def test_what_is_said_around_a_header_that_comes_again_is_left_out_with_it(aroun
     (tmp_path / "cell.dta").write_text(
         "\n".join([*above, header, *around[1], *lines[:100], *around[0], header, *around[1], *lines[100:]])
     )
-    same(read(tmp_path / "cell.dta", "the header comes again, and is left out: row 10"))
+    same(read(tmp_path / "cell.dta", "left out, as words stand for the time: row 10"))
     assert [source.stem for source in many.find_sources([str(tmp_path)])] == ["cell"]
+
+
+@pytest.mark.parametrize(
+    "words", ["Step 3;Discharge;2 A", "# next step", "Min,2.699,2.0", "Total;1.80", "Cell;12\nDate;13.03.2023", "Alarm: 3"]
+)
+@pytest.mark.parametrize("places", [[3], [-1], [3, 120, 200, -1]])
+def test_rows_whose_time_is_words_are_none_if_they_are_few(words, places, tmp_path):
+    lines = TABLE.assign(day=DAYS).rename(columns={"day": "Zeit"}).to_csv(index=False).splitlines()
+    for place in sorted(places, reverse=True):
+        lines[place % len(lines) + 1 : place % len(lines) + 1] = words.replace(";", ",").split("\n")
+    (tmp_path / "cell.csv").write_text("\n".join(lines))
+    same(read(tmp_path / "cell.csv", "left out, as words stand for the time: row "))
+    lines[1::3] = [f"at {line}" for line in lines[1::3]]
+    (tmp_path / "cell.csv").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=r"the column 'time' must hold numbers, got 'at 0\.0' in row 1"):
+        read_discharges(tmp_path / "cell.csv")
 
 
 @pytest.mark.parametrize("ends", [(1, 0), (0, 1), (3, 2)])

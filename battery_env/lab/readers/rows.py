@@ -10,6 +10,7 @@ import itertools
 import re
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,7 @@ _MANY_TIMES = 3.0
 _DEAD_SHARE = 0.1
 # Temperatures that a cell may have, degC.
 _TEMPERATURES_C = (-60.0, 150.0)
+_BEGINS_AS_NUMBER = re.compile(r"\s*[-+.,]*\d")
 _THOUSANDS = re.compile(r"^\s*[-+]?\d{1,3}(?:[,.' ]\d{3})+(?:[.,]\d+)?\s*$")
 
 
@@ -52,7 +54,7 @@ def cells_of(table: pd.DataFrame, columns: Mapping[str, Column]) -> dict[str, pd
     The rows of each cell, of a table with columns by quantity as they were written, whose index counts the rows below the
     header; the name is empty where the table holds one cell.
     """
-    for mend in (without_blank_rows, without_headers, without_cut_line):
+    for mend in (without_blank_rows, without_words, without_cut_line):
         table = mend(table, columns)
     if len(table) < LEAST_SAMPLES:
         raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows below the header, got {len(table)}")
@@ -90,17 +92,28 @@ def without_blank_rows(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd
     return table[~table[_measured(table)].isna().all(axis=1)]
 
 
-def without_headers(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
-    """Without the header where it comes again, as in files that were put one behind the other, and what is said around it."""
-    measured = _measured(table)
-    if any(pd.api.types.is_numeric_dtype(table[each].dtype) for each in measured):
-        return table  # no name is among numbers
-    again = np.logical_and.reduce([table[each].astype(str).str.strip() == columns[each].name for each in measured])
-    if again.any():
-        _say(f"the header comes again, and is left out: row {_place(table, again)}")
-        words = table[measured].drop(columns="time").apply(pd.to_numeric, errors="coerce").isna().all(axis=1)
-        again = words & pd.Series(again, table.index).groupby((words != words.shift()).cumsum()).transform("any")
-    return table[~again]
+def without_words(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
+    """Without rows of words in place of the time, where few places have such: titles, summaries, headers that come again."""
+    if not pd.api.types.is_object_dtype(table["time"].dtype) and not pd.api.types.is_string_dtype(table["time"].dtype):
+        return table
+    text = table["time"].astype(str)
+    is_time = text.str.match(_BEGINS_AS_NUMBER)
+    words, measured = ~is_time & table["time"].notna(), _measured(table)
+    if not words.any() or not is_time.mean() > 0.5:
+        return table
+    # what stands among them and is no measurement either, as the number of a cell, is none of a row
+    others = table[[each for each in measured if "time" not in each]]
+    nothing = words | others.apply(pd.to_numeric, errors="coerce").isna().all(axis=1)
+    block = (nothing != nothing.shift()).cumsum()
+    nothing &= words.groupby(block).transform("any")
+    if block[nothing].nunique() > max(1.0, SWITCH_SHARE * len(table)):
+        return table
+    _say(f"left out, as words stand for the time: row {_place(table, nothing.to_numpy())}, {text[words].iloc[0].strip()!r}")
+    kept = table[~nothing].copy()
+    for name in measured:
+        with suppress(ValueError, TypeError):  # words among numbers made text of all
+            kept[name] = pd.to_numeric(kept[name])
+    return kept
 
 
 def without_cut_line(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:

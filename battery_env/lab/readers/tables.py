@@ -43,8 +43,6 @@ _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
 _DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
 # Some testers put lines as a whole in quotes.
 _QUOTED_LINES = re.compile(rb'^"([^"\n]*)"\s*$', flags=re.MULTILINE)
-# So many lines below a table may be no part of it.
-_FOOT_LINES = 50
 # What is packed is read in parts of so many bytes, or rows.
 _CHUNK_BYTES, _BATCH_ROWS = 1 << 20, 1 << 16
 # A table is known by so many of its first rows.
@@ -110,7 +108,7 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
     # one column may serve as two quantities
     positions = sorted({*range(layout.layers), *(column.position for column in columns.values())})
 
-    def read(rows: int | None = None) -> pd.DataFrame:
+    def read() -> pd.DataFrame:
         try:
             found = pd.read_csv(
                 io.BytesIO(source) if isinstance(source, bytes) else source,
@@ -120,7 +118,6 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
                 header=None,
                 names=range(len(layout.names)) if layout.layers else None,
                 skiprows=header_lines,
-                nrows=rows,
                 usecols=positions,
                 index_col=False,
                 low_memory=False,
@@ -143,17 +140,6 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
             raise
         warnings.warn("the last line is cut within quotes, and left out", stacklevel=2)
         return _read_text(kept.encode(layout.encoding), file_format)
-    measured = [
-        columns[quantity].position for quantity in ("voltage", "current", "power", "charge_step") if quantity in columns
-    ]
-    foot = 0 if layout.layers else _foot_lines(table[measured])
-    text = table[columns["time"].position].tail(foot).dropna().astype(str).str.strip()
-    if len(text):
-        warnings.warn(
-            f"lines below the table, which hold neither voltage nor current, are left out: {text.iloc[0]!r}", stacklevel=2
-        )
-        # once more, as text below a column makes text of it
-        table = read(len(table) - foot)
     table = _lowest_layer(table, layout.layers)
     return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
 
@@ -184,12 +170,6 @@ def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
     above = table[numbers].notna().any(axis=1)
     table[numbers] = table[numbers].ffill()
     return table[~above]
-
-
-def _foot_lines(measured: pd.DataFrame) -> int:
-    """How many of the last rows hold neither voltage nor current."""
-    nothing = measured.tail(_FOOT_LINES).apply(pd.to_numeric, errors="coerce").isna().all(axis=1).to_numpy()
-    return int(np.argmin(nothing[::-1])) if len(nothing) else 0
 
 
 def _check_archive(path: Path) -> None:
