@@ -272,6 +272,7 @@ def test_what_is_said_around_a_header_that_comes_again_is_left_out_with_it(aroun
     "words", ["Step 3;Discharge;2 A", "# next step", "Min,2.699,2.0", "Total;1.80", "Cell;12\nDate;13.03.2023", "Alarm: 3"]
 )
 @pytest.mark.parametrize("places", [[3], [-1], [3, 120, 200, -1]])
+@pytest.mark.filterwarnings("ignore:the last line")
 def test_rows_whose_time_is_words_are_none_if_they_are_few(words, places, tmp_path):
     lines = TABLE.assign(day=DAYS).rename(columns={"day": "Zeit"}).to_csv(index=False).splitlines()
     for place in sorted(places, reverse=True):
@@ -772,6 +773,45 @@ def test_the_first_rows_of_a_step_under_a_clock_of_each_step_may_be_missing(miss
     table.loc[table["step"] == 8, "time"] += 300.0
     with pytest.raises(ValueError, match="time_s must increase"):
         read_discharges(table)
+
+
+@pytest.mark.parametrize("cycles", [None, ([1], [1]), ([1], [2]), ([3], [1])])
+@pytest.mark.parametrize("charge", [0, len(CHARGE)])
+@pytest.mark.parametrize("start_s", [0.0, 0.7])
+def test_where_the_clock_starts_anew_at_rest_another_test_begins(cycles, charge, start_s):
+    test = CYCLE[len(CHARGE) - charge :].assign(time=lambda rows: rows["time"] - rows["time"].iloc[0] + start_s)
+    rest = pd.DataFrame({"time": test["time"].iloc[[0, -1]] + [-5.0, 50.0], "voltage": [3.5, 3.3], "current": 0.0})
+    test = pd.concat([rest[:1], test, rest[1:]], ignore_index=True)
+    # nor are the tests alike
+    other = test.assign(voltage=test["voltage"] + 0.0001, current=0.999 * test["current"])
+    table = pd.concat([test, other], ignore_index=True)
+    if cycles:
+        table["Cycle"] = np.repeat([each[0] for each in cycles], len(test))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = read_discharges(table)
+    said = f"the clock starts anew at rest, where another test begins: row {len(test) + 1}"
+    assert [str(each.message) for each in caught] == ([] if cycles == ([1], [2]) else [said])
+    assert [each.meta["cycle"] for each in found] == ([3, 1] if cycles == ([3], [1]) else [1, 2])
+    for each, share in zip(found, (1.0, 0.999), strict=True):
+        assert each.charge_C == pytest.approx(share * RECORD.charge_C, rel=2e-3)
+        assert each.time_s[0] == 0.0
+
+
+@pytest.mark.parametrize("cycles", [((1, 1), (1, 1)), ((1, 2), (1, 2)), ((1, 1), (2, 2))])
+def test_sheets_of_a_workbook_whose_clock_and_cycles_start_anew_are_cells(cycles, tmp_path):
+    pytest.importorskip("openpyxl", reason="the extra excel is not installed")
+    names = {"time": "Test_Time(s)", "voltage": "Voltage(V)", "current": "Current(A)"}
+    table = pd.concat([CYCLE, CYCLE.assign(time=CYCLE["time"] + 8000.0)]).rename(columns=names)
+    with pd.ExcelWriter(tmp_path / "cell.xlsx") as writer:
+        for name, (one, two) in zip(("Channel_1-008_1", "Channel_1-009_1"), cycles, strict=True):
+            sheet = table.assign(Cycle_Index=np.repeat([one, two], len(CYCLE)))
+            for part, rows in enumerate((sheet[: len(CYCLE)], sheet[len(CYCLE) :])):
+                rows.to_excel(writer, sheet_name=f"{name}{part}", index=False)
+    found = read_discharges(tmp_path / "cell.xlsx")
+    np.testing.assert_allclose([each.charge_C for each in found], RECORD.charge_C, rtol=3e-3)
+    cells = [each.meta.get("cell") for each in found]
+    assert cells == (4 * [None] if cycles[1][0] == 2 else [f"Channel_1-{each}_10" for each in ("008", "008", "009", "009")])
 
 
 @pytest.mark.parametrize("rest_rows", [0, 20_000])

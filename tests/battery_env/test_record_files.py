@@ -235,11 +235,14 @@ def test_dates_are_read_as_they_are_written(tmp_path):
         np.testing.assert_allclose(one(tmp_path / "cell.csv").time_s, expected_s, atol=1e-6, err_msg=name)
 
 
-def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
+def test_discharges_whose_charges_are_not_logged_need_a_number_or_a_clock_that_starts_anew_at_rest(tmp_path):
     parts = [pd.DataFrame({"time_s": TIME_S, "voltage_V": VOLTAGE_V - 0.01 * n, "current_A": CURRENT_A}) for n in (1, 2)]
     pd.concat([part.assign(cycle=n) for n, part in enumerate(parts)]).to_csv(tmp_path / "life.csv", index=False)
     assert [discharge.meta["cycle"] for discharge in read_discharges(tmp_path / "life.csv")] == [0, 1]
     pd.concat(parts).to_csv(tmp_path / "life.csv", index=False)
+    with pytest.warns(UserWarning, match="the clock starts anew at rest, where another test begins: row 65"):
+        assert [discharge.meta["cycle"] for discharge in read_discharges(tmp_path / "life.csv")] == [1, 2]
+    pd.concat([parts[0], parts[1][CURRENT_A.argmax() :]]).to_csv(tmp_path / "life.csv", index=False)
     with pytest.raises(ValueError, match=r"time_s must increase .* or number them in a column of the cycle"):
         read_discharges(tmp_path / "life.csv")
     parts[1]["time_s"] += 9000.0

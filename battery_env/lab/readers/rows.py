@@ -76,6 +76,7 @@ def mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: File
         without_repeated,
         on_one_clock,
         with_clock_going_on,
+        with_tests_apart,
         with_steps_apart,
         without_rows_out_of_time,
     ):
@@ -465,6 +466,28 @@ def without_repeated(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[~repeated]
 
 
+def with_tests_apart(rows: pd.DataFrame) -> pd.DataFrame:
+    """Where the clock starts anew, near where it began, while the cell rests, another test begins. Cycles are numbered on."""
+    time_s, step_s = rows["time"].to_numpy(), np.append(np.diff(rows["time"]), 0.0)
+    rests = (rows["current"].abs() <= _rest_A(rows["current"])).to_numpy()
+    cycle = rows["cycle"].to_numpy(copy=True) if "cycle" in rows else np.zeros(len(rows))
+    starts, few, usual_s = [0], int(max(1.0, _FEW_SHARE * len(rows))), float(np.median(step_s))
+    for n in (np.flatnonzero((step_s[:-1] < 0.0) & rests[:-1] & rests[1:] & (np.diff(cycle) <= 0.0)) + 1).tolist():
+        # rows out of time are few, and the clock goes on as before while the cell still rests
+        ends = (time_s[n : n + few + 1] >= time_s[n - 1]) | ~rests[n : n + few + 1]
+        goes_on = ends.any() and rests[n + int(np.argmax(ends))]
+        if not goes_on and time_s[n] <= time_s[starts[-1]] + _MANY_TIMES * max(usual_s, step_s[n]):
+            starts.append(n)
+    test = np.isin(np.arange(len(rows)), starts[1:])
+    if not test.any():
+        return rows
+    _say(f"the clock starts anew at rest, where another test begins: row {_place(rows, test)}")
+    for begin, end in itertools.pairwise([*starts, len(rows)]):
+        again = np.isin(np.unique(cycle[begin:end]), cycle[:begin]).any()
+        cycle[begin:end] += cycle[:begin].max() + 1.0 - cycle[begin:end].min() if again else 0.0
+    return rows.assign(test=np.cumsum(test), **({"cycle": cycle} if "cycle" in rows else {}))
+
+
 def with_steps_apart(rows: pd.DataFrame) -> pd.DataFrame:
     """Of two rows at one time, between which the step changes or the load is switched, the second is the later one."""
     time_s, jump_A = rows["time"].to_numpy(), np.diff(rows["current"], prepend=rows["current"].iloc[:1])
@@ -489,12 +512,12 @@ def _passed_C(rows: pd.DataFrame) -> float:
 def without_rows_out_of_time(rows: pd.DataFrame) -> pd.DataFrame:
     """
     Without rows that are not later than all before them, if they are few, or say what the others say, and if little charge
-    passes from each to the next, as all of that is lost where a clock was put back. A clock may start anew with a cycle.
+    passes from each to the next, as all of that is lost where a clock was put back. Cycles and tests may have own clocks.
     """
     time = rows["time"]
     if (np.diff(time) > 0.0).all():
         return rows
-    cycle = pd.Series(np.cumsum(_changes(rows, "cycle") & (np.diff(time, prepend=-np.inf) < 0.0)), index=rows.index)
+    cycle = pd.Series(np.cumsum(_changes(rows, "cycle", "test") & (np.diff(time, prepend=-np.inf) < 0.0)), index=rows.index)
     latest = time.groupby(cycle).cummax().groupby(cycle).shift()
     twice, back = (time == latest).to_numpy(), (time < latest).to_numpy()
     kept, few = rows[~(twice | back)], max(1.0, _FEW_SHARE * len(rows))

@@ -295,15 +295,25 @@ def _sheet(path: Path, file_format: FileFormat) -> bytes:
     found = []
     for sheet in sheets.values():
         head = [[str(name) for name in row] for row in sheet.head(_FIRST_ROWS).to_numpy()]
-        counts = [count_required(names, file_format.columns) for names in head] or [0]
-        line = int(np.argmax(counts))
-        found.append((counts[line], len(sheet), head[line : line + 1], line, sheet))
+        known = [count_required(names, file_format.columns) for names in head] or [0]
+        line = int(np.argmax(known))
+        found.append((known[line], len(sheet), head[line : line + 1], line, sheet))
     names = max(found, key=lambda each: each[:2])[2]
     (top, first), *others = [(line, sheet) for *_, each, line, sheet in found if each == names]
-    parts = [first, *(sheet.iloc[line + 1 :] for line, sheet in others)]
-    if others and not has("cycle", [name for row in names for name in row]):  # each may be a test of its own
+    parts, header = [first, *(sheet.iloc[line + 1 :] for line, sheet in others)], [name for row in names for name in row]
+    if others and not has("cycle", header):  # each may be a test of its own
         parts = [part.assign(cycle=str(number)) for number, part in enumerate(parts, start=1)]
         parts[0].iloc[top, -1] = "Cycle"
+    elif others and not has("cell", header):  # each whose clock and cycles do not go on is a cell of its own
+        columns = find_columns(header, file_format)
+        places = [columns[each].position for each in ("time", "cycle") if each in columns]
+        counts = [part.iloc[:, places].apply(pd.to_numeric, errors="coerce").dropna() for part in parts]
+        if all(len(each) and each.iloc[:, 0].is_monotonic_increasing for each in counts):
+            anew = [True, *((after.iloc[0] <= before.iloc[-1]).all() for before, after in itertools.pairwise(counts))]
+            titles = pd.Series([title for title, each in zip(sheets, found, strict=True) if each[2] == names])
+            cells = titles.where(pd.Series(anew)).ffill()
+            parts = [part.assign(cell=cell) for part, cell in zip(parts, cells, strict=True)]
+            parts[0].iloc[top, -1] = "Cell"
     return pd.concat(parts).to_csv(header=False, index=False).encode()
 
 
