@@ -142,6 +142,12 @@ DAYS = 45000.3 + RECORD.time_s / 86400.0
 DATES = [f"{date:%d.%m.%Y %H:%M:%S}" for date in pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(RECORD.time_s, unit="s")]
 
 
+def test_dates_in_digits_are_read_as_dates():
+    dates = pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(np.floor(RECORD.time_s), unit="s")
+    for digits in (dates.strftime("%Y%m%d%H%M%S").astype(np.int64), dates.strftime("%Y%m%d%H%M%S").astype(float)):
+        near(read(TABLE.assign(time=digits).rename(columns={"time": "Timestamp"})))
+
+
 @pytest.mark.parametrize(("unit", "in_a_second"), [("minutes", 1 / 60), ("hours", 1 / 3600), ("milliseconds", 1e3), ("", 1.0)])
 @pytest.mark.parametrize("beside", [{"DPT Time": DATES}, {"Zeit": DAYS}, {"Date_Time(s)": 5.0 + RECORD.time_s}])
 def test_dates_tell_what_a_clock_without_a_unit_counts(unit, in_a_second, beside):
@@ -354,9 +360,11 @@ def test_a_row_of_the_step_before_its_load_changes_nothing():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("options", [{}, {"discharge_is_negative": True}, {"discharge_is_negative": False}])
-@pytest.mark.parametrize("order", [["CHARGE", "REST", "TABLE"], ["TABLE", "REST", "CHARGE"]])
+@pytest.mark.parametrize("order", [["CHARGE", "REST", "TABLE"], ["TABLE", "REST", "CHARGE"], ["LOW", "FLAT", "REST", "TABLE"]])
 def test_a_current_without_a_sign_is_refused(sign, options, order):
-    parts = [globals()[name] for name in order]
+    # a charge whose voltage jumps more than it rises
+    low, flat = REST.assign(voltage=3.7), CHARGE.assign(voltage=np.linspace(3.9, 4.2, 60))
+    parts = [{"LOW": low, "FLAT": flat}.get(name, globals().get(name)) for name in order]
     parts = [part.assign(time=part["time"] - part["time"].iloc[0] + 4000.0 * n) for n, part in enumerate(parts)]
     table = pd.concat(parts, ignore_index=True)
     table["current"] = sign * table["current"].abs()

@@ -270,7 +270,7 @@ def test_discharges_whose_charges_are_not_logged_need_a_number_or_a_clock_that_s
         ({"current_A": 0.01 * np.sin(TIME_S)}, "cannot be told"),
         ({"voltage_V": 3.7}, "whether the current of a discharge is positive or negative cannot be told"),
         ({"Voltage(V)": VOLTAGE_V - 0.1}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
-        ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "cannot be told"),
+        ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "the current has no sign"),
         (
             {"time_s": [f"{1e3 * time_s:,.1f}" for time_s in TIME_S]},
             "'time_s' must hold numbers, got '5,000.0' in row 2. Write numbers without separators of thousands",

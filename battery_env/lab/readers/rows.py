@@ -38,6 +38,8 @@ _LONG_SHARE = 0.25
 _STEP_S = 1e-3
 # What a clock may count in, s.
 _TICKS_S = (3600.0, 60.0, 1.0, 0.1, 0.01)
+# Numbers from here on may be dates in digits, as 20260227225000.
+_LEAST_DATE = 1e13
 _DAY_S = CLOCKS["days"][1]
 # What is so many times what is usual is not usual.
 _MANY_TIMES = 3.0
@@ -311,7 +313,10 @@ def _cycles(values: pd.Series, column: Column) -> FloatArray:
 def seconds(values: pd.Series, column: Column) -> FloatArray:
     """Numbers in their unit; a clock, hours:minutes:seconds, in seconds; dates in seconds since the earliest one."""
     if pd.api.types.is_numeric_dtype(values.dtype):
-        return numbers(values, column)
+        if not values.min() >= _LEAST_DATE:
+            return numbers(values, column)
+        dates = pd.to_datetime((values // 1).astype("Int64").astype("string"), format="%Y%m%d%H%M%S", errors="coerce")
+        return numbers(values, column) if dates.isna().any() else seconds(dates, column)
     if pd.api.types.is_datetime64_any_dtype(values.dtype):
         return (values - values.min()).dt.total_seconds().to_numpy(dtype=np.float64)
     if pd.api.types.is_timedelta64_dtype(values.dtype):
@@ -589,7 +594,10 @@ def _rest_A(current_A: pd.Series[float]) -> float:
 
 
 def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
-    """Refuse a current of one sign under which, once it has grown, the voltage rises for long, while elsewhere it falls."""
+    """
+    Refuse a current of one sign under which, once it has grown, the voltage rises for long, while elsewhere it falls; or with
+    which the voltage jumps up where a rest ends, while elsewhere it jumps down.
+    """
     size_A, voltage_V = rows["current"].abs().to_numpy(), rows["voltage"].to_numpy()
     jump_A = np.diff(size_A, prepend=0.0)
     begin = np.union1d([0], np.flatnonzero(np.abs(jump_A) > SWITCH_SHARE * size_A.max()))
@@ -603,6 +611,10 @@ def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
     relaxes = (jump_A[begin] < 0.0) & (voltage_V[end] < before_V)
     rests = np.maximum.reduceat(size_A, begin) <= SWITCH_SHARE * size_A.max()
     rise_V[rests | ((~is_long | relaxes) & (rise_V > 0.0))] = 0.0
+    jump_V = voltage_V[np.minimum(begin + 1, end)] - voltage_V[np.maximum(begin - 1, 0)]
+    jump_V[rests | ~is_long | (begin == 0) | (size_A[begin - 1] > SWITCH_SHARE * size_A.max()) | (jump_V * rise_V < 0.0)] = 0.0
+    if min(jump_V.max(), -jump_V.min()) > _LONG_SHARE * np.abs(jump_V).max():
+        rise_V, long_V = jump_V, 0.0
     if rise_V.max() > long_V and np.minimum(rise_V, 0.0).sum() < -long_V:
         known = " and ".join(repr(column.name) for key, column in columns.items() if key.startswith("state"))
         raise ValueError(
