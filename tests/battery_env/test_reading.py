@@ -302,6 +302,21 @@ def test_rows_without_a_cell_at_the_ends_are_named(ends):
         same(read(table.assign(current=sign * table["current"]), "is left out: 0.003 V without a current is no cell"))
 
 
+@pytest.mark.parametrize(
+    ("missing", "rows"), [("voltage", [40, 90, 91, 130]), ("voltage", [LOAD_ON]), ("current", [100, 101])]
+)
+def test_a_few_values_that_are_missing_cost_what_they_are_worth(missing, rows):
+    table = TABLE.copy()
+    table.loc[rows, missing] = np.nan
+    discharge = read(table, f"left out, as the {missing} is missing: row {rows[0] + 1}")
+    near(discharge)
+    lost_C = 2.0 * 0.5 * (RECORD.time_s[102] - RECORD.time_s[99] + 9.4) if missing == "current" else 0.0
+    assert discharge.shown.uncounted_C == pytest.approx(lost_C / 3.0**0.5, rel=0.1, abs=0.5)
+    table.loc[np.arange(90, 130), missing] = np.nan
+    with pytest.raises(ValueError, match=f"the {missing} must be finite, got nan in row "):
+        read_discharges(table)
+
+
 def test_a_row_a_step_is_no_record():
     step = pd.DataFrame({"time": [3600.0, 4200.0, 6800.0, 7400.0], "voltage": [4.2, 4.19, 2.7, 3.2]})
     step["current"] = [1.5, 0.0, -2.0, 0.0]

@@ -261,7 +261,11 @@ def test_discharges_whose_charges_are_not_logged_need_a_number_or_a_clock_that_s
             {"time_s": [clock(time_s)[:5] for time_s in TIME_S]},
             "time_s must increase .*with a clock that tells it from the next",
         ),
-        ({"voltage_V": np.where(TIME_S == 40.0, np.nan, VOLTAGE_V)}, "the voltage must be finite, got nan in row 4"),
+        ({"voltage_V": np.where(TIME_S % 80.0 == 40.0, np.nan, VOLTAGE_V)}, "the voltage must be finite, got nan in row 4"),
+        (
+            {"current_A": np.where(abs(TIME_S - 700.0) < 60.0, np.nan, CURRENT_A)},
+            "the current must be finite, got nan in row ",
+        ),
         (
             {"voltage_V": ["4.1", "OVERLOAD", *map(str, VOLTAGE_V[2:])]},
             "'voltage_V' must hold numbers, got 'OVERLOAD' in row 2",

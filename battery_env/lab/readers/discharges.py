@@ -357,7 +357,7 @@ def _with_count(shown: Shown, rows: pd.DataFrame) -> Shown:
         return shown
     part = slice(loaded[0], loaded[-1] + 1)
     if "lost" in rows:  # all of it in each step of the program, none, or any part in all alike
-        shown = shown._replace(uncounted_C=float(rows["lost"].to_numpy()[part][1:] @ np.abs(current_A[part][:-1])) / 3.0**0.5)
+        shown = shown._replace(uncounted_C=float(rows["lost"].to_numpy()[part][1:].sum()) / 3.0**0.5)
     if "capacity" not in rows or len(loaded) < LEAST_SAMPLES:
         return shown
     step_C = np.diff(rows["capacity"].to_numpy()[part])

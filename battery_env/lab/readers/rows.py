@@ -375,13 +375,26 @@ def without_dead_ends(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def without_missing(rows: pd.DataFrame) -> pd.DataFrame:
-    """Refuses rows in which a measurement is missing."""
-    for name in REQUIRED:
-        bad = np.flatnonzero(~np.isfinite(rows[name]))
-        if len(bad):
-            place = rows.index[bad[0]] + 1
-            raise ValueError(f"the {name} must be finite, got {rows[name].iloc[bad[0]]} in row {place}. Remove such rows.")
-    return rows
+    """
+    Without rows in which the voltage or the current is missing, if they are few, and what they drew is known but for little:
+    of a voltage it is, and of a current it is in doubt.
+    """
+    known = {name: np.isfinite(rows[name].to_numpy()) for name in REQUIRED}
+    kept = np.logical_and.reduce([*known.values()])
+    if kept.all():
+        return rows
+    place, current_A = np.arange(len(rows)), np.where(known["current"], rows["current"], 0.0)
+    beside_A = np.interp(place, place[kept], current_A[kept]) if kept.any() else current_A
+    worth_C = np.where(kept, 0.0, np.abs(current_A - beside_A) * np.abs(np.gradient(rows["time"])))
+    is_little = worth_C.sum() / 3.0**0.5 <= _FEW_SHARE * _passed_C(rows[kept])
+    for name, is_known in known.items():
+        if not is_known.all():
+            n = int(np.argmin(is_known))
+            if name == "time" or not is_little or (~kept).sum() > SWITCH_SHARE * len(rows):
+                got = rows[name].iloc[n]
+                raise ValueError(f"the {name} must be finite, got {got} in row {rows.index[n] + 1}. Remove such rows.")
+            _say(f"left out, as the {name} is missing: row {_place(rows, ~is_known)}")
+    return rows[kept].assign(lost=np.diff(np.cumsum(worth_C)[kept], prepend=0.0))
 
 
 def _changes(rows: pd.DataFrame, *names: str) -> BoolArray:
@@ -440,7 +453,8 @@ def on_one_clock(rows: pd.DataFrame) -> pd.DataFrame:
     lost_s[new], offsets_s[new] = np.where(is_end, 0.0, last_s), time_s[new - 1]
     unknown = f"; what passed in between, up to {lost_s.max():g} s each, is unknown" if lost_s.any() else ""
     _say(f"the time starts anew with each step, and is added up{unknown}")
-    return rows.assign(time=time_s + np.cumsum(offsets_s), lost=lost_s)
+    lost_C = lost_s * np.abs(np.roll(rows["current"], 1)) + (rows["lost"] if "lost" in rows else 0.0)
+    return rows.assign(time=time_s + np.cumsum(offsets_s), lost=lost_C)
 
 
 def with_clock_going_on(rows: pd.DataFrame) -> pd.DataFrame:
