@@ -732,6 +732,25 @@ def test_titles_are_no_names(separator, tmp_path):
     same(read(tmp_path / "cell.txt", columns={"time": "a", "voltage": "b", "current": "c"}))
 
 
+@pytest.mark.parametrize("separator", [",", "\t", " "])
+def test_rows_of_one_field_more_than_names_shift_no_column(separator, tmp_path):
+    rows = TABLE.to_csv(index=False, header=False, sep=separator).splitlines()
+    dates = [f"{date:%Y-%m-%d %H:%M:%S.%f}" for date in pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(TABLE["time"], "s")]
+    with_date = [date.replace(" ", separator) + row[row.index(separator) :] for row, date in zip(rows, dates, strict=True)]
+    as_r_writes = [f'"{number}"{separator}{row}' for number, row in enumerate(rows, start=1)]
+    for lines in (as_r_writes, with_date):
+        (tmp_path / "cell.txt").write_text("\n".join([separator.join(f'"{name}"' for name in TABLE), *lines]))
+        same(read(tmp_path / "cell.txt"), atol=2e-6)
+    for more in ("{0}{1}7", "7{1}{0}", "{0}{1}7{1}8"):
+        lines = [more.format(row, separator) for row in rows]
+        (tmp_path / "cell.txt").write_text("\n".join([separator.join(TABLE), *lines]))
+        with pytest.raises(ValueError, match=r"rows have [45] fields below 3 names"):
+            read_discharges(tmp_path / "cell.txt")
+    text = TABLE.to_string(index=False, header=False)
+    (tmp_path / "cell.txt").write_text(f"  Test Time (s)  Cell Voltage (V)   Current (A)\n{text}")
+    near(read(tmp_path / "cell.txt"))
+
+
 def test_a_voltage_that_jumps_against_what_passes_leaves_the_sign_open():
     """The drop over a wire that a load shares with a sensor of a pack can exceed that of the cell."""
     table = TABLE.assign(voltage=TABLE["voltage"] - 0.3 * TABLE["current"])

@@ -8,6 +8,7 @@ import gzip
 import io
 import itertools
 import lzma
+import operator
 import re
 import warnings
 import zipfile
@@ -38,6 +39,7 @@ _DELIMITERS = (",", ";", "\t", _BLANKS)
 _ITS_COMMA = re.compile(r"^(\s*[-+]?\d*),(?=\d)")
 _DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
 _NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
+_DATE, _CLOCK = re.compile(r"\d+([-./])\d+\1\d+$"), re.compile(r"\d+:\d\d")
 _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
 # What Excel reads in the first line of a file: the delimiter.
 _DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
@@ -62,6 +64,7 @@ class _Layout(NamedTuple):
     names: list[str]
     layers: int  # so many columns at the left number what lies above a row, as its cycle and its step
     rows: list[list[str]]  # fields of the first lines below the header
+    clock: int | None  # the column that goes on a date in the one before
 
 
 def read_columns(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
@@ -106,7 +109,7 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
     columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
     header_lines += bool(layout.rows) and are_units(layout.rows[0])
     # one column may serve as two quantities
-    positions = sorted({*range(layout.layers), *(column.position for column in columns.values())})
+    positions = sorted({*range(layout.layers), *filter(None, [layout.clock]), *(each.position for each in columns.values())})
 
     def read() -> pd.DataFrame:
         try:
@@ -141,6 +144,9 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
         warnings.warn("the last line is cut within quotes, and left out", stacklevel=2)
         return _read_text(kept.encode(layout.encoding), file_format)
     table = _lowest_layer(table, layout.layers)
+    if layout.clock and layout.clock - 1 in table:
+        date, clock = (table[place].astype("string") for place in (layout.clock - 1, layout.clock))
+        table[layout.clock - 1] = date.str.cat(clock, sep=" ").astype(object)
     return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
 
 
@@ -197,7 +203,8 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
     if stated := _DELIMITER_LINE.match(lines[0]):
         lines[0], delimiters = "", (stated[1],)
     number, delimiter = _header(lines, delimiters, chosen)
-    names, rows = _fields(lines[number], delimiter), [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
+    rows = [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
+    names, clock = _names(_fields(lines[number], delimiter, len(next(filter(None, rows), lines))), rows)
     layers = next((n for n, name in enumerate(names) if name), 0) if delimiter != _BLANKS else 0
     below = [any(row[:layers]) for row in rows if any(row)]
     if sum(below) >= 0.5 * len(below):
@@ -207,7 +214,27 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
         names[n] = above[-1] if above else ""
     values = [field for row in rows for field in row]
     commas, points = (sum(map(bool, map(mark.match, values))) for mark in (_DECIMAL_COMMA, _DECIMAL_POINT))
-    return _Layout(encoding, number, delimiter, "," if commas > points and delimiter != _BLANKS else ".", names, layers, rows)
+    return _Layout(
+        encoding, number, delimiter, "," if commas > points and delimiter != _BLANKS else ".", names, layers, rows, clock
+    )
+
+
+def _names(names: list[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], int | None]:
+    """The names with an empty one where most rows have one field more, of their number or of a clock, whose column is told."""
+    filled = [[*itertools.dropwhile(operator.not_, row[::-1])][::-1] for row in rows if any(row)]
+    wider = [row for row in filled if len(row) > len(names)]
+    if len(wider) <= 0.5 * len(filled):
+        return names, None
+    if all(len(row) == len(names) + 1 for row in wider):
+        if [row[0] for row in wider] == [*map(str, range(1, len(wider) + 1))]:
+            return ["", *names], None
+        for n, fields in enumerate(itertools.pairwise(zip(*wider, strict=True)), start=1):
+            if all(map(_DATE.match, fields[0])) and all(map(_CLOCK.match, fields[1])):
+                return [*names[:n], "", *names[n:]], n
+    raise ValueError(
+        f"rows have {len(wider[0])} fields below {len(names)} names, so that it is not known which is which: name each column, "
+        "and take another delimiter than the decimal comma"
+    )
 
 
 def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str, str] | None) -> tuple[int, str]:
@@ -216,9 +243,10 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
     for number, line in enumerate(lines):
         next_line = next(filter(str.strip, itertools.islice(lines, number + 1, None)), "")
         for delimiter in delimiters:
-            names = _fields(line, delimiter)
+            width = len(_fields(next_line, delimiter))
+            names = _fields(line, delimiter, width)
             # blanks within names, or in a sentence
-            if delimiter == _BLANKS and (len(_fields(next_line, delimiter)) < len(names) or _count_numbers(names)):
+            if delimiter == _BLANKS and (width < len(names) or _count_numbers(names)):
                 continue
             if (count := count_required(names, chosen)) > found:
                 best, found = (number, delimiter), count
@@ -260,11 +288,11 @@ def _decoded(head: bytes) -> tuple[str, str]:
         return encoding, head.decode(encoding, errors="ignore")
 
 
-def _fields(line: str, delimiter: str) -> list[str]:
+def _fields(line: str, delimiter: str, most: float = np.inf) -> list[str]:
     # numpy writes a header as a comment
     line = line.lstrip("# ")
-    if delimiter == _BLANKS:
-        return line.split()
+    if delimiter == _BLANKS:  # of which two or more part names of several words
+        return fields if len(fields := line.replace('"', " ").split()) <= most else re.split(r"\s{2,}", line.strip())
     try:
         return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
     except csv.Error:
