@@ -794,14 +794,36 @@ def test_a_cell_may_be_driven_a_little_below_0_V():
     assert read(TABLE.assign(voltage=TABLE["voltage"] - TABLE["voltage"].min() - 0.01)).voltage_V.min() < 0.0
 
 
-def test_days_stand_before_the_hours_of_a_clock():
+@pytest.mark.parametrize("day", ["{}-", "{}.", "{} days ", "{} day, ", "1900-01-{:02d} "])
+@pytest.mark.parametrize("fraction", [".", ",", ":"])
+def test_days_stand_before_the_hours_of_a_clock(day, fraction):
     later_s = np.round(RECORD.time_s + 85000.0, 2)
-    days = [f"{later // 86400:.0f}-" if later >= 86400.0 else "" for later in later_s]
+    days = [day.format(int(later // 86400)) if later >= 86400.0 else "" for later in later_s]
     clock = [day + time.strftime("%H:%M:", time.gmtime(t)) + f"{t % 60:05.2f}" for day, t in zip(days, later_s, strict=True)]
     names = {"time": "TestTime", "voltage": "Vol", "current": "Cur"}
-    found = read(TABLE.assign(time=clock).rename(columns=names))
+    found = read(
+        TABLE.assign(time=[text.replace(".", fraction) if day != "{}." else text for text in clock]).rename(columns=names)
+    )
     np.testing.assert_allclose(found.time_s, later_s)
     near(found)
+
+
+def test_a_date_alone_is_midnight():
+    dates = pd.Timestamp("2026-02-28") + pd.to_timedelta(np.floor(RECORD.time_s) - np.floor(RECORD.time_s[100]), unit="s")
+    for style in ("%Y-%m-%d %H:%M:%S", "%d.%m.%Y %H:%M:%S"):
+        text = [date.removesuffix(" 00:00:00") for date in dates.strftime(style)]
+        near(read(TABLE.assign(time=text).rename(columns={"time": "Date"})))
+    with pytest.raises(ValueError, match="must hold numbers, got '2026-02-28' in row 1"):
+        read_discharges(TABLE.assign(time="2026-02-28"))
+
+
+def test_signs_of_typographers_and_strokes_between_columns_are_read(tmp_path):
+    text = TABLE.to_csv(index=False, sep="|")
+    (tmp_path / "cell.txt").write_text(text.replace("-", "\u2212"), encoding="utf-8")
+    same(read(tmp_path / "cell.txt"))
+    text = TABLE.to_csv(index=False, sep=";", decimal=",")
+    (tmp_path / "cell.txt").write_text(text.replace("-", "\u2212"), encoding="utf-16")
+    same(read(tmp_path / "cell.txt"))
 
 
 @pytest.mark.parametrize("missing", [0, 6])

@@ -47,6 +47,13 @@ _MANY_TIMES = 3.0
 _DEAD_SHARE = 0.1
 # Temperatures that a cell may have, degC.
 _TEMPERATURES_C = (-60.0, 150.0)
+# Fractions behind a comma or a colon, days as in 1-02:03:04, 1.02:03:04, 1 day, 2:03:04, and of workbooks, which count from
+# 1900 on, and dates alone, which are midnight.
+_AS_CLOCKS = {
+    r"(?<=\d),(?=\d)|(?<=:\d\d:\d\d):(?=\d)": ".",
+    r"^(?:1900-01-(\d+)[ T]|(\d+)(?:[-.]| days?,? ))(?=\d+:)": r"\1\2 days ",
+    r"^(\d+([-./])\d+\2\d+)$": r"\1 00:00:00",
+}
 _BEGINS_AS_NUMBER = re.compile(r"\s*[-+.,]*\d")
 _THOUSANDS = re.compile(r"^\s*[-+]?\d{1,3}(?:[,.' ]\d{3})+(?:[.,]\d+)?\s*$")
 
@@ -321,10 +328,12 @@ def seconds(values: pd.Series, column: Column) -> FloatArray:
         return (values - values.min()).dt.total_seconds().to_numpy(dtype=np.float64)
     if pd.api.types.is_timedelta64_dtype(values.dtype):
         return values.dt.total_seconds().to_numpy(dtype=np.float64)
-    if not values.dropna().astype(str).str.contains(":").all():
+    lines = "\n".join(map(str.strip, values.astype(str)))
+    for pattern, clock in _AS_CLOCKS.items() if ":" in lines else ():
+        lines = re.sub(pattern, clock, lines, flags=re.MULTILINE)
+    text = pd.Series(lines.split("\n"), index=values.index)
+    if not text[values.notna()].str.contains(":").all():
         return numbers(values, column)
-    # some count days as in 1-02:03:04
-    text = values.astype(str).str.strip().str.replace(",", ".").str.replace(r"^(\d+)-(?=\d+:)", r"\1 days ", regex=True)
     # UTC, as the clocks of a time zone are put forward and back
     readings: tuple[tuple[Callable[..., Any], dict[str, Any]], ...] = (
         (pd.to_timedelta, {}),

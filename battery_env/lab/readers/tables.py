@@ -35,7 +35,7 @@ _OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open
 # Testers write what they know about a test above the table: so many bytes are searched for its header.
 _HEAD_BYTES = 1 << 18
 _BLANKS = r"\s+"
-_DELIMITERS = (",", ";", "\t", _BLANKS)
+_DELIMITERS = (",", ";", "\t", "|", _BLANKS)
 _ITS_COMMA = re.compile(r"^(\s*[-+]?\d*),(?=\d)")
 _DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
 _NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
@@ -129,7 +129,9 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
             raise ValueError("there are no rows below the header") from error
         except Exception as error:  # pandas raises whatever the damage leads it to
             raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
-        # words among numbers make text of all
+        # words among numbers make text of all, as do signs of typographers
+        for column in {columns[quantity].position for quantity in ("voltage", "current") if quantity in columns}:
+            found[column] = found[column].replace("\u2212", "-", regex=True)
         return found if layout.decimal == "." else found.replace(_ITS_COMMA, r"\1.", regex=True)
 
     try:
@@ -232,8 +234,8 @@ def _names(names: list[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], 
             if all(map(_DATE.match, fields[0])) and all(map(_CLOCK.match, fields[1])):
                 return [*names[:n], "", *names[n:]], n
     raise ValueError(
-        f"rows have {len(wider[0])} fields below {len(names)} names, so that it is not known which is which: name each column, "
-        "and take another delimiter than the decimal comma"
+        f"rows have {len(wider[0])} fields below {len(names)} names, which does not tell what is what: name each column, and "
+        "take another delimiter than the decimal comma"
     )
 
 
