@@ -113,6 +113,20 @@ def test_a_finer_clock_is_taken_where_one_has_the_same_time_twice_and_else_named
         read_discharges(table)
 
 
+@pytest.mark.parametrize("rounded", [np.round, np.floor])
+def test_a_finer_clock_that_starts_anew_refines_a_coarse_one(rounded):
+    starts = np.cumsum(np.isin(np.arange(len(TABLE)), [30, 150]))
+    fine = TABLE["time"] - TABLE.groupby(starts)["time"].transform("first")
+    table = TABLE.assign(time=rounded(TABLE["time"] / 36.0) / 100.0, **{"Step Time (s)": fine})
+    found = read(table.rename(columns={"time": "Total Time (h)"}))
+    np.testing.assert_allclose(found.time_s - found.time_s[0], RECORD.time_s, atol=10.0)
+    near(found)
+    # but not one that does not agree with it
+    table["Step Time (s)"] *= 1.1
+    with pytest.warns(UserWarning), contextlib.suppress(ValueError):
+        assert len(read_discharges(table.rename(columns={"time": "Total Time (h)"}))[0].time_s) < len(TABLE)
+
+
 def test_of_three_electrodes_the_cell_is_taken():
     table = TABLE.rename(columns={"time": "time/s", "voltage": "Ewe-Ece/V", "current": "I/A"})
     table["Ece/V"] = np.linspace(0.05, 0.2, len(table))

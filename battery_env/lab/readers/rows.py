@@ -210,6 +210,8 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
         is_finer = len(np.unique(values)) > len(np.unique(best))
         if _agree(best, values, quantity):
             best = values if is_finer else best
+        elif quantity == "time" and (refined_s := _refined(best, values)) is not None:
+            best = refined_s
         elif _goes_on_where(values, best):
             _say(f"the time is {other.name!r}, as {column.name!r} goes back")
             best = values
@@ -221,6 +223,18 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
         elif is_finer:
             _say(f"the time is {column.name!r}; {other.name!r} tells more rows apart, but is another clock")
     return best
+
+
+def _refined(coarse_s: FloatArray, fine_s: FloatArray) -> FloatArray | None:
+    """A coarse clock as a finer one tells it that starts anew, and agrees with it from each start to the next."""
+    ticks_s, part = np.diff(np.unique(coarse_s)), np.cumsum(np.diff(fine_s, prepend=fine_s[:1]) < 0.0)
+    if not len(ticks_s) or not part[-1]:
+        return None
+    off_s = pd.Series(coarse_s - fine_s).groupby(part)
+    low_s, high_s = off_s.transform("min").to_numpy(), off_s.transform("max").to_numpy()
+    refined_s = fine_s + 0.5 * (low_s + high_s)
+    is_finer = (np.diff(refined_s) > 0.0).sum() > (np.diff(coarse_s) > 0.0).sum() and (np.diff(refined_s) >= 0.0).all()
+    return refined_s if is_finer and (high_s - low_s <= (1.0 + _NOTHING_SHARE) * ticks_s.min()).all() else None
 
 
 def _goes_on_where(other_s: FloatArray, time_s: FloatArray) -> bool:
