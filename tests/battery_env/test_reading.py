@@ -765,6 +765,20 @@ def test_rows_of_one_field_more_than_names_shift_no_column(separator, tmp_path):
     near(read(tmp_path / "cell.txt"))
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_of_headers_that_with_the_most_rows_below_that_fit_it_is_taken(separator, tmp_path):
+    program = pd.DataFrame(
+        {"Step": [1, 2, 3], "Current (A)": [1.5, 0.0, 2.0], "Voltage (V)": [4.2, 0.0, 2.7], "Time (s)": 9e4}
+    )
+    above, text = (table.to_csv(index=False, sep=separator) for table in (program, TABLE))
+    (tmp_path / "cell.txt").write_text(f"{above}\n{text}")
+    same(read(tmp_path / "cell.txt", "the header is line 6; the table of line 1 is left out"))
+    text = text.replace("time", "X_Value", 1)
+    (tmp_path / "cell.txt").write_text(f"Units{separator}Volts{separator}Amps{separator}K\nEnd of header\n{text}")
+    with pytest.warns(UserWarning), pytest.raises(ValueError, match="no column for the time among X_Value, voltage, current"):
+        read_discharges(tmp_path / "cell.txt")
+
+
 def test_a_voltage_that_jumps_against_what_passes_leaves_the_sign_open():
     """The drop over a wire that a load shares with a sensor of a pack can exceed that of the cell."""
     table = TABLE.assign(voltage=TABLE["voltage"] - 0.3 * TABLE["current"])

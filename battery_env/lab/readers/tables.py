@@ -241,24 +241,35 @@ def _names(names: list[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], 
 
 def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str, str] | None) -> tuple[int, str]:
     """The line with the names of the columns, and the delimiter."""
-    best, found = (0, delimiters[0]), -1
-    for number, line in enumerate(lines):
-        next_line = next(filter(str.strip, itertools.islice(lines, number + 1, None)), "")
-        for delimiter in delimiters:
-            width = len(_fields(next_line, delimiter))
-            names = _fields(line, delimiter, width)
-            # blanks within names, or in a sentence
-            if delimiter == _BLANKS and (width < len(names) or _count_numbers(names)):
-                continue
-            if (count := count_required(names, chosen)) > found:
-                best, found = (number, delimiter), count
-        if found == len(REQUIRED):
-            break
-    if found > 0:
-        return best
     filled = [number for number, line in enumerate(lines) if line.strip()]
     if not filled:
         raise ValueError("the file is empty")
+    best: dict[tuple[str, ...], tuple[int, str]] = {}
+    found = 1
+    for number, below in itertools.pairwise([*filled, filled[-1]]):
+        for delimiter in delimiters:
+            most = len(_fields(lines[below], delimiter)) if delimiter == _BLANKS else np.inf
+            names = _fields(lines[number], delimiter, most)
+            has_numbers = _count_numbers(names) > 0
+            # blanks within names, or in a sentence
+            if (delimiter == _BLANKS and len(names) > most) or (
+                has_numbers and (delimiter == _BLANKS or found == len(REQUIRED))
+            ):
+                continue
+            count = count_required(names, chosen)
+            if count > found:
+                best, found = {}, count
+            if count == found and (not best or not has_numbers):
+                best.setdefault(tuple(filter(None, names)), (number, delimiter))
+            if found == len(REQUIRED):
+                delimiters = (delimiter,)
+                break
+    if best:
+        first, *others = best.values()
+        header = max([first, *others], key=lambda each: _fit(lines, *each)) if others else first
+        if header != first:
+            warnings.warn(f"the header is line {header[0] + 1}; the table of line {first[0] + 1} is left out", stacklevel=2)
+        return header
     # names come apart as often as the first numbers below them
     for above, number in itertools.pairwise([-1, *filled]):
         apart = [each for each in delimiters if _count_numbers(_fields(lines[number], each)) > 1]
@@ -270,6 +281,14 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
         if apart:
             raise ValueError("there is no line with the names of the columns above the numbers. Add one")
     return filled[0], delimiters[0]
+
+
+def _fit(lines: Sequence[str], number: int, delimiter: str) -> int:
+    """How well the lines below a header hold numbers in as many fields as it has names; a delimiter may end each."""
+    rows = [_fields(line, delimiter) for line in lines[number + 1 :]]
+    width = len(_fields(lines[number], delimiter, max(map(len, rows), default=0)))
+    filled = [len([*filter(None, row)]) if _count_numbers(row) > 1 else -1 for row in rows]
+    return sum(2 * (count >= 0 and len(row) == width) or count == width for row, count in zip(rows, filled, strict=True))
 
 
 def _count_numbers(fields: Sequence[str]) -> int:
