@@ -755,6 +755,8 @@ def test_rows_of_one_field_more_than_names_shift_no_column(separator, tmp_path):
     for lines in (as_r_writes, with_date):
         (tmp_path / "cell.txt").write_text("\n".join([separator.join(f'"{name}"' for name in TABLE), *lines]))
         same(read(tmp_path / "cell.txt"), atol=2e-6)
+    (tmp_path / "cell.txt").write_text("\n".join([separator.join(TABLE), *(f"{row}{separator}ok" for row in rows)]))
+    same(read(tmp_path / "cell.txt"))
     for more in ("{0}{1}7", "7{1}{0}", "{0}{1}7{1}8"):
         lines = [more.format(row, separator) for row in rows]
         (tmp_path / "cell.txt").write_text("\n".join([separator.join(TABLE), *lines]))
@@ -827,7 +829,7 @@ def test_a_cell_may_be_driven_a_little_below_0_V():
 def test_days_stand_before_the_hours_of_a_clock(day, fraction):
     later_s = np.round(RECORD.time_s + 85000.0, 2)
     days = [day.format(int(later // 86400)) if later >= 86400.0 else "" for later in later_s]
-    clock = [day + time.strftime("%H:%M:", time.gmtime(t)) + f"{t % 60:05.2f}" for day, t in zip(days, later_s, strict=True)]
+    clock = [day + time.strftime("%H:%M:", time.gmtime(t)) + f"{t % 60:06.3f}" for day, t in zip(days, later_s, strict=True)]
     names = {"time": "TestTime", "voltage": "Vol", "current": "Cur"}
     found = read(
         TABLE.assign(time=[text.replace(".", fraction) if day != "{}." else text for text in clock]).rename(columns=names)

@@ -50,7 +50,7 @@ _TEMPERATURES_C = (-60.0, 150.0)
 # Fractions behind a comma or a colon, days as in 1-02:03:04, 1.02:03:04, 1 day, 2:03:04, and of workbooks, which count from
 # 1900 on, and dates alone, which are midnight.
 _AS_CLOCKS = {
-    r"(?<=\d),(?=\d)|(?<=:\d\d:\d\d):(?=\d)": ".",
+    r"(?<=\d),(?=\d)|(?<=:\d\d:\d\d):(?=\d{3}$)": ".",
     r"^(?:1900-01-(\d+)[ T]|(\d+)(?:[-.]| days?,? ))(?=\d+:)": r"\1\2 days ",
     r"^(\d+([-./])\d+\2\d+)$": r"\1 00:00:00",
 }

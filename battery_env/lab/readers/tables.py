@@ -233,6 +233,8 @@ def _names(names: list[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], 
         for n, fields in enumerate(itertools.pairwise(zip(*wider, strict=True)), start=1):
             if all(map(_DATE.match, fields[0])) and all(map(_CLOCK.match, fields[1])):
                 return [*names[:n], "", *names[n:]], n
+    if not any(_count_numbers(row[len(names) :]) for row in wider):  # remarks
+        return names, None
     raise ValueError(
         f"rows have {len(wider[0])} fields below {len(names)} names, which does not tell what is what: name each column, and "
         "take another delimiter than the decimal comma"
