@@ -104,21 +104,21 @@ def without_blank_rows(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd
 
 def without_words(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
     """Without rows of words in place of the time, where few places have such: titles, summaries, headers that come again."""
-    if not pd.api.types.is_object_dtype(table["time"].dtype) and not pd.api.types.is_string_dtype(table["time"].dtype):
-        return table
-    text = table["time"].astype(str)
-    is_time = text.str.match(_BEGINS_AS_NUMBER)
-    words, measured = ~is_time & table["time"].notna(), _measured(table)
-    if not words.any() or not is_time.mean() > 0.5:
+    time, measured = table["time"], _measured(table)
+    is_text = pd.api.types.is_object_dtype(time.dtype) or pd.api.types.is_string_dtype(time.dtype)
+    is_time = time.astype(str).str.match(_BEGINS_AS_NUMBER) if is_text else time.notna()
+    if is_time.all() or not is_time.mean() > 0.5:
         return table
     # what stands among them and is no measurement either, as the number of a cell, is none of a row
-    others = table[[each for each in measured if "time" not in each]]
-    nothing = words | others.apply(pd.to_numeric, errors="coerce").isna().all(axis=1)
+    others = table[[each for each in measured if "time" not in each]].apply(pd.to_numeric, errors="coerce").isna().all(axis=1)
+    words = ~is_time & (time.notna() | others)
+    nothing = words | others
     block = (nothing != nothing.shift()).cumsum()
     nothing &= words.groupby(block).transform("any")
-    if block[nothing].nunique() > max(1.0, SWITCH_SHARE * len(table)):
+    if not nothing.any() or block[nothing].nunique() > max(1.0, SWITCH_SHARE * len(table)):
         return table
-    _say(f"left out, as words stand for the time: row {_place(table, nothing.to_numpy())}, {text[words].iloc[0].strip()!r}")
+    text = str(table.loc[words, measured].iloc[0].dropna().iloc[0]).strip()
+    _say(f"left out, as words stand for the time: row {_place(table, nothing.to_numpy())}, {text!r}")
     kept = table[~nothing].copy()
     for name in measured:
         with suppress(ValueError, TypeError):  # words among numbers made text of all
