@@ -356,7 +356,7 @@ def _sheet(path: Path, file_format: FileFormat) -> bytes:
         parts = [part.assign(cycle=str(number)) for number, part in enumerate(parts, start=1)]
         parts[0].iloc[top, -1] = "Cycle"
     elif others and not has("cell", header):  # each whose clock and cycles do not go on is a cell of its own
-        columns = find_columns(header, file_format)
+        columns = find_columns(header, file_format, ())
         places = [columns[each].position for each in ("time", "cycle") if each in columns]
         counts = [part.iloc[:, places].apply(pd.to_numeric, errors="coerce").dropna() for part in parts]
         if all(len(each) and each.iloc[:, 0].is_monotonic_increasing for each in counts):
