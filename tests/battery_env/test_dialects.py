@@ -47,7 +47,7 @@ FEATURES = {
     "encoding": ["utf-8", "utf-8-sig", "utf-16", "latin-1"],
     "line": ["\n", "\r\n", "\r"],
     "repeated": [0, 1, 20],
-} | dict.fromkeys(["rests", "again", "blank", "cut", "trailing", "index", "packed"], (False, True))
+} | dict.fromkeys(["rests", "again", "titles", "blank", "cut", "trailing", "index", "packed"], (False, True))
 
 
 def rows_of(f):
@@ -127,6 +127,9 @@ def write(f, folder):
         lines[-1] = lines[-1][: lines[-1].index(separator) + 1]
     elif f["below"]:
         lines.append(f["below"])
+    if f["titles"]:
+        for place in (head + 40, head + 20):
+            lines[place:place] = ["Next step", ""]
     if f["blank"]:
         lines[9:9] = [""]
     content = f["line"].join([*f["above"].split("\n"), *lines]).encode(f["encoding"], errors="replace")

@@ -112,6 +112,20 @@ def test_a_finer_clock_is_taken_where_one_has_the_same_time_twice_and_else_named
         read_discharges(table)
 
 
+@pytest.mark.parametrize("rounded", [np.round, np.floor])
+def test_a_finer_clock_that_starts_anew_refines_a_coarse_one(rounded):
+    starts = np.cumsum(np.isin(np.arange(len(TABLE)), [30, 150]))
+    fine = TABLE["time"] - TABLE.groupby(starts)["time"].transform("first")
+    table = TABLE.assign(time=rounded(TABLE["time"] / 36.0) / 100.0, **{"Step Time (s)": fine})
+    found = read(table.rename(columns={"time": "Total Time (h)"}))
+    np.testing.assert_allclose(found.time_s - found.time_s[0], RECORD.time_s, atol=10.0)
+    near(found)
+    # but not one that does not agree with it
+    table["Step Time (s)"] *= 1.1
+    with pytest.warns(UserWarning), contextlib.suppress(ValueError):
+        assert len(read_discharges(table.rename(columns={"time": "Total Time (h)"}))[0].time_s) < len(TABLE)
+
+
 def test_of_three_electrodes_the_cell_is_taken():
     table = TABLE.rename(columns={"time": "time/s", "voltage": "Ewe-Ece/V", "current": "I/A"})
     table["Ece/V"] = np.linspace(0.05, 0.2, len(table))
@@ -139,6 +153,12 @@ def test_a_power_or_a_charge_a_row_tells_the_current(unit, factor):
 
 DAYS = 45000.3 + RECORD.time_s / 86400.0
 DATES = [f"{date:%d.%m.%Y %H:%M:%S}" for date in pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(RECORD.time_s, unit="s")]
+
+
+def test_dates_in_digits_are_read_as_dates():
+    dates = pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(np.floor(RECORD.time_s), unit="s")
+    for digits in (dates.strftime("%Y%m%d%H%M%S").astype(np.int64), dates.strftime("%Y%m%d%H%M%S").astype(float)):
+        near(read(TABLE.assign(time=digits).rename(columns={"time": "Timestamp"})))
 
 
 @pytest.mark.parametrize(("unit", "in_a_second"), [("minutes", 1 / 60), ("hours", 1 / 3600), ("milliseconds", 1e3), ("", 1.0)])
@@ -263,8 +283,25 @@ def test_what_is_said_around_a_header_that_comes_again_is_left_out_with_it(aroun
     (tmp_path / "cell.dta").write_text(
         "\n".join([*above, header, *around[1], *lines[:100], *around[0], header, *around[1], *lines[100:]])
     )
-    same(read(tmp_path / "cell.dta", "the header comes again, and is left out: row 10"))
+    same(read(tmp_path / "cell.dta", "left out, as words stand for the time: row 10"))
     assert [source.stem for source in many.find_sources([str(tmp_path)])] == ["cell"]
+
+
+@pytest.mark.parametrize(
+    "words", ["Step 3;Discharge;2 A", "# next step", "Min,2.699,2.0", "Total;1.80", "Cell;12\nDate;13.03.2023", "Alarm: 3"]
+)
+@pytest.mark.parametrize("places", [[3], [-1], [3, 120, 200, -1]])
+@pytest.mark.filterwarnings("ignore:the last line")
+def test_rows_whose_time_is_words_are_none_if_they_are_few(words, places, tmp_path):
+    lines = TABLE.assign(day=DAYS).rename(columns={"day": "Zeit"}).to_csv(index=False).splitlines()
+    for place in sorted(places, reverse=True):
+        lines[place % len(lines) + 1 : place % len(lines) + 1] = words.replace(";", ",").split("\n")
+    (tmp_path / "cell.csv").write_text("\n".join(lines))
+    same(read(tmp_path / "cell.csv", "left out, as words stand for the time: row "))
+    lines[1::3] = [f"at {line}" for line in lines[1::3]]
+    (tmp_path / "cell.csv").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=r"the column 'time' must hold numbers, got 'at 0\.0' in row 1"):
+        read_discharges(tmp_path / "cell.csv")
 
 
 @pytest.mark.parametrize("ends", [(1, 0), (0, 1), (3, 2)])
@@ -276,6 +313,21 @@ def test_rows_without_a_cell_at_the_ends_are_named(ends):
     table["time"] = np.concatenate([np.arange(-ends[0], 0), RECORD.time_s, RECORD.time_s[-1] + 1 + np.arange(ends[1])])
     for sign in (1, -1):
         same(read(table.assign(current=sign * table["current"]), "is left out: 0.003 V without a current is no cell"))
+
+
+@pytest.mark.parametrize(
+    ("missing", "rows"), [("voltage", [40, 90, 91, 130]), ("voltage", [LOAD_ON]), ("current", [100, 101])]
+)
+def test_a_few_values_that_are_missing_cost_what_they_are_worth(missing, rows):
+    table = TABLE.copy()
+    table.loc[rows, missing] = np.nan
+    discharge = read(table, f"left out, as the {missing} is missing: row {rows[0] + 1}")
+    near(discharge)
+    lost_C = 2.0 * 0.5 * (RECORD.time_s[102] - RECORD.time_s[99] + 9.4) if missing == "current" else 0.0
+    assert discharge.shown.uncounted_C == pytest.approx(lost_C / 3.0**0.5, rel=0.1, abs=0.5)
+    table.loc[np.arange(90, 130), missing] = np.nan
+    with pytest.raises(ValueError, match=f"the {missing} must be finite, got nan in row "):
+        read_discharges(table)
 
 
 def test_a_row_a_step_is_no_record():
@@ -336,9 +388,11 @@ def test_a_row_of_the_step_before_its_load_changes_nothing():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("options", [{}, {"discharge_is_negative": True}, {"discharge_is_negative": False}])
-@pytest.mark.parametrize("order", [["CHARGE", "REST", "TABLE"], ["TABLE", "REST", "CHARGE"]])
+@pytest.mark.parametrize("order", [["CHARGE", "REST", "TABLE"], ["TABLE", "REST", "CHARGE"], ["LOW", "FLAT", "REST", "TABLE"]])
 def test_a_current_without_a_sign_is_refused(sign, options, order):
-    parts = [globals()[name] for name in order]
+    # a charge whose voltage jumps more than it rises
+    low, flat = REST.assign(voltage=3.7), CHARGE.assign(voltage=np.linspace(3.9, 4.2, 60))
+    parts = [{"LOW": low, "FLAT": flat}.get(name, globals().get(name)) for name in order]
     parts = [part.assign(time=part["time"] - part["time"].iloc[0] + 4000.0 * n) for n, part in enumerate(parts)]
     table = pd.concat(parts, ignore_index=True)
     table["current"] = sign * table["current"].abs()
@@ -672,6 +726,41 @@ def test_titles_are_no_names(separator, tmp_path):
     same(read(tmp_path / "cell.txt", columns={"time": "a", "voltage": "b", "current": "c"}))
 
 
+@pytest.mark.parametrize("separator", [",", "\t", " "])
+def test_rows_of_one_field_more_than_names_shift_no_column(separator, tmp_path):
+    rows = TABLE.to_csv(index=False, header=False, sep=separator).splitlines()
+    dates = [f"{date:%Y-%m-%d %H:%M:%S.%f}" for date in pd.Timestamp("2026-02-27 23:50") + pd.to_timedelta(TABLE["time"], "s")]
+    with_date = [date.replace(" ", separator) + row[row.index(separator) :] for row, date in zip(rows, dates, strict=True)]
+    as_r_writes = [f'"{number}"{separator}{row}' for number, row in enumerate(rows, start=1)]
+    for lines in (as_r_writes, with_date):
+        (tmp_path / "cell.txt").write_text("\n".join([separator.join(f'"{name}"' for name in TABLE), *lines]))
+        same(read(tmp_path / "cell.txt"), atol=2e-6)
+    (tmp_path / "cell.txt").write_text("\n".join([separator.join(TABLE), *(f"{row}{separator}ok" for row in rows)]))
+    same(read(tmp_path / "cell.txt"))
+    for more in ("{0}{1}7", "7{1}{0}", "{0}{1}7{1}8"):
+        lines = [more.format(row, separator) for row in rows]
+        (tmp_path / "cell.txt").write_text("\n".join([separator.join(TABLE), *lines]))
+        with pytest.raises(ValueError, match=r"rows have [45] fields below 3 names"):
+            read_discharges(tmp_path / "cell.txt")
+    text = TABLE.to_string(index=False, header=False)
+    (tmp_path / "cell.txt").write_text(f"  Test Time (s)  Cell Voltage (V)   Current (A)\n{text}")
+    near(read(tmp_path / "cell.txt"))
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_of_headers_that_with_the_most_rows_below_that_fit_it_is_taken(separator, tmp_path):
+    program = pd.DataFrame(
+        {"Step": [1, 2, 3], "Current (A)": [1.5, 0.0, 2.0], "Voltage (V)": [4.2, 0.0, 2.7], "Time (s)": 9e4}
+    )
+    above, text = (table.to_csv(index=False, sep=separator) for table in (program, TABLE))
+    (tmp_path / "cell.txt").write_text(f"{above}\n{text}")
+    same(read(tmp_path / "cell.txt", "the header is line 6; the table of line 1 is left out"))
+    text = text.replace("time", "X_Value", 1)
+    (tmp_path / "cell.txt").write_text(f"Units{separator}Volts{separator}Amps{separator}K\nEnd of header\n{text}")
+    with pytest.warns(UserWarning), pytest.raises(ValueError, match="no column for the time among X_Value, voltage, current"):
+        read_discharges(tmp_path / "cell.txt")
+
+
 def test_a_voltage_that_jumps_against_what_passes_leaves_the_sign_open():
     """The drop over a wire that a load shares with a sensor of a pack can exceed that of the cell."""
     table = TABLE.assign(voltage=TABLE["voltage"] - 0.3 * TABLE["current"])
@@ -715,14 +804,36 @@ def test_a_cell_may_be_driven_a_little_below_0_V():
     assert read(TABLE.assign(voltage=TABLE["voltage"] - TABLE["voltage"].min() - 0.01)).voltage_V.min() < 0.0
 
 
-def test_days_stand_before_the_hours_of_a_clock():
+@pytest.mark.parametrize("day", ["{}-", "{}.", "{} days ", "{} day, ", "1900-01-{:02d} "])
+@pytest.mark.parametrize("fraction", [".", ",", ":"])
+def test_days_stand_before_the_hours_of_a_clock(day, fraction):
     later_s = np.round(RECORD.time_s + 85000.0, 2)
-    days = [f"{later // 86400:.0f}-" if later >= 86400.0 else "" for later in later_s]
-    clock = [day + time.strftime("%H:%M:", time.gmtime(t)) + f"{t % 60:05.2f}" for day, t in zip(days, later_s, strict=True)]
+    days = [day.format(int(later // 86400)) if later >= 86400.0 else "" for later in later_s]
+    clock = [day + time.strftime("%H:%M:", time.gmtime(t)) + f"{t % 60:06.3f}" for day, t in zip(days, later_s, strict=True)]
     names = {"time": "TestTime", "voltage": "Vol", "current": "Cur"}
-    found = read(TABLE.assign(time=clock).rename(columns=names))
+    found = read(
+        TABLE.assign(time=[text.replace(".", fraction) if day != "{}." else text for text in clock]).rename(columns=names)
+    )
     np.testing.assert_allclose(found.time_s, later_s)
     near(found)
+
+
+def test_a_date_alone_is_midnight():
+    dates = pd.Timestamp("2026-02-28") + pd.to_timedelta(np.floor(RECORD.time_s) - np.floor(RECORD.time_s[100]), unit="s")
+    for style in ("%Y-%m-%d %H:%M:%S", "%d.%m.%Y %H:%M:%S"):
+        text = [date.removesuffix(" 00:00:00") for date in dates.strftime(style)]
+        near(read(TABLE.assign(time=text).rename(columns={"time": "Date"})))
+    with pytest.raises(ValueError, match="must hold numbers, got '2026-02-28' in row 1"):
+        read_discharges(TABLE.assign(time="2026-02-28"))
+
+
+def test_signs_of_typographers_and_strokes_between_columns_are_read(tmp_path):
+    text = TABLE.to_csv(index=False, sep="|")
+    (tmp_path / "cell.txt").write_text(text.replace("-", "\u2212"), encoding="utf-8")
+    same(read(tmp_path / "cell.txt"))
+    text = TABLE.to_csv(index=False, sep=";", decimal=",")
+    (tmp_path / "cell.txt").write_text(text.replace("-", "\u2212"), encoding="utf-16")
+    same(read(tmp_path / "cell.txt"))
 
 
 @pytest.mark.parametrize("missing", [0, 6])
@@ -736,6 +847,45 @@ def test_the_first_rows_of_a_step_under_a_clock_of_each_step_may_be_missing(miss
     table.loc[table["step"] == 8, "time"] += 300.0
     with pytest.raises(ValueError, match="time_s must increase"):
         read_discharges(table)
+
+
+@pytest.mark.parametrize("cycles", [None, ([1], [1]), ([1], [2]), ([3], [1])])
+@pytest.mark.parametrize("charge", [0, len(CHARGE)])
+@pytest.mark.parametrize("start_s", [0.0, 0.7])
+def test_where_the_clock_starts_anew_at_rest_another_test_begins(cycles, charge, start_s):
+    test = CYCLE[len(CHARGE) - charge :].assign(time=lambda rows: rows["time"] - rows["time"].iloc[0] + start_s)
+    rest = pd.DataFrame({"time": test["time"].iloc[[0, -1]] + [-5.0, 50.0], "voltage": [3.5, 3.3], "current": 0.0})
+    test = pd.concat([rest[:1], test, rest[1:]], ignore_index=True)
+    # nor are the tests alike
+    other = test.assign(voltage=test["voltage"] + 0.0001, current=0.999 * test["current"])
+    table = pd.concat([test, other], ignore_index=True)
+    if cycles:
+        table["Cycle"] = np.repeat([each[0] for each in cycles], len(test))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = read_discharges(table)
+    said = f"the clock starts anew at rest, where another test begins: row {len(test) + 1}"
+    assert [str(each.message) for each in caught] == ([] if cycles == ([1], [2]) else [said])
+    assert [each.meta["cycle"] for each in found] == ([3, 1] if cycles == ([3], [1]) else [1, 2])
+    for each, share in zip(found, (1.0, 0.999), strict=True):
+        assert each.charge_C == pytest.approx(share * RECORD.charge_C, rel=2e-3)
+        assert each.time_s[0] == 0.0
+
+
+@pytest.mark.parametrize("cycles", [((1, 1), (1, 1)), ((1, 2), (1, 2)), ((1, 1), (2, 2))])
+def test_sheets_of_a_workbook_whose_clock_and_cycles_start_anew_are_cells(cycles, tmp_path):
+    pytest.importorskip("openpyxl", reason="the extra excel is not installed")
+    names = {"time": "Test_Time(s)", "voltage": "Voltage(V)", "current": "Current(A)"}
+    table = pd.concat([CYCLE, CYCLE.assign(time=CYCLE["time"] + 8000.0)]).rename(columns=names)
+    with pd.ExcelWriter(tmp_path / "cell.xlsx") as writer:
+        for name, (one, two) in zip(("Channel_1-008_1", "Channel_1-009_1"), cycles, strict=True):
+            sheet = table.assign(Cycle_Index=np.repeat([one, two], len(CYCLE)))
+            for part, rows in enumerate((sheet[: len(CYCLE)], sheet[len(CYCLE) :])):
+                rows.to_excel(writer, sheet_name=f"{name}{part}", index=False)
+    found = read_discharges(tmp_path / "cell.xlsx")
+    np.testing.assert_allclose([each.charge_C for each in found], RECORD.charge_C, rtol=3e-3)
+    cells = [each.meta.get("cell") for each in found]
+    assert cells == (4 * [None] if cycles[1][0] == 2 else [f"Channel_1-{each}_10" for each in ("008", "008", "009", "009")])
 
 
 @pytest.mark.parametrize("rest_rows", [0, 20_000])

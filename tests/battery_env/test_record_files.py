@@ -234,11 +234,14 @@ def test_dates_are_read_as_they_are_written(tmp_path):
         np.testing.assert_allclose(one(tmp_path / "cell.csv").time_s, expected_s, atol=1e-6, err_msg=name)
 
 
-def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
+def test_discharges_whose_charges_are_not_logged_need_a_number_or_a_clock_that_starts_anew_at_rest(tmp_path):
     parts = [pd.DataFrame({"time_s": TIME_S, "voltage_V": VOLTAGE_V - 0.01 * n, "current_A": CURRENT_A}) for n in (1, 2)]
     pd.concat([part.assign(cycle=n) for n, part in enumerate(parts)]).to_csv(tmp_path / "life.csv", index=False)
     assert [discharge.meta["cycle"] for discharge in read_discharges(tmp_path / "life.csv")] == [0, 1]
     pd.concat(parts).to_csv(tmp_path / "life.csv", index=False)
+    with pytest.warns(UserWarning, match="the clock starts anew at rest, where another test begins: row 65"):
+        assert [discharge.meta["cycle"] for discharge in read_discharges(tmp_path / "life.csv")] == [1, 2]
+    pd.concat([parts[0], parts[1][CURRENT_A.argmax() :]]).to_csv(tmp_path / "life.csv", index=False)
     with pytest.raises(ValueError, match=r"time_s must increase .* or number them in a column of the cycle"):
         read_discharges(tmp_path / "life.csv")
     parts[1]["time_s"] += 9000.0
@@ -257,7 +260,11 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
             {"time_s": [clock(time_s)[:5] for time_s in TIME_S]},
             "time_s must increase .*with a clock that tells it from the next",
         ),
-        ({"voltage_V": np.where(TIME_S == 40.0, np.nan, VOLTAGE_V)}, "the voltage must be finite, got nan in row 4"),
+        ({"voltage_V": np.where(TIME_S % 80.0 == 40.0, np.nan, VOLTAGE_V)}, "the voltage must be finite, got nan in row 4"),
+        (
+            {"current_A": np.where(abs(TIME_S - 700.0) < 60.0, np.nan, CURRENT_A)},
+            "the current must be finite, got nan in row ",
+        ),
         (
             {"voltage_V": ["4.1", "OVERLOAD", *map(str, VOLTAGE_V[2:])]},
             "'voltage_V' must hold numbers, got 'OVERLOAD' in row 2",
@@ -266,7 +273,7 @@ def test_discharges_whose_charges_are_not_logged_need_a_number(tmp_path):
         ({"current_A": 0.01 * np.sin(TIME_S)}, "cannot be told"),
         ({"voltage_V": 3.7}, "whether the current of a discharge is positive or negative cannot be told"),
         ({"Voltage(V)": VOLTAGE_V - 0.1}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
-        ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "cannot be told"),
+        ({"current_A": np.abs(np.sin(TIME_S)), "voltage_V": 3.7 + 0.3 * np.cos(TIME_S)}, "the current has no sign"),
         (
             {"time_s": [f"{1e3 * time_s:,.1f}" for time_s in TIME_S]},
             "'time_s' must hold numbers, got '5,000.0' in row 2. Write numbers without separators of thousands",

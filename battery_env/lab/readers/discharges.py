@@ -107,8 +107,8 @@ def read_discharges(
     It may hold charges and rests as well, many cycles, and several cells if a column names them. A discharge is what lies
     between two charges, with the rest before the load; it is numbered by the cycle that is given, or else counted. If there
     are several, each has its own clock, which starts at its first sample. Discharges whose charges are not logged are told
-    apart by the column of the cycle alone. What is mended is said in a warning. A temperature that is missing in some rows is
-    interpolated.
+    apart by the column of the cycle, or a clock that starts anew at rest, alone. What is mended is said in a warning. A
+    temperature that is missing in some rows is interpolated.
 
     .. code-block:: python
 
@@ -230,18 +230,19 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> 
 
 def _bounds(rows: pd.DataFrame) -> list[int]:
     """
-    Where the number of the cycle changes, but not where that parts a rest from its load, or a discharge whose voltage goes on:
-    counters may count loops, or go up where the load is switched on.
+    Where a test begins, or the number of the cycle changes, but not where that parts a rest from its load, or a discharge
+    whose voltage goes on: counters may count loops, or go up where the load is switched on.
     """
     bounds = [0]
-    if "cycle" in rows:
+    if {"cycle", "test"} & set(rows):
         time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
         switch_A, lowest_V = SWITCH_SHARE * np.abs(current_A).max(), voltage_V.min()
         charged = np.zeros(len(rows), dtype=np.bool_)
         for start, end, _, is_braking in _charges(current_A, _passed_C(time_s, current_A)):
             charged[start:end] = not is_braking and current_A[start:end].min() < -switch_A
         charges, under_load = np.flatnonzero(charged), np.flatnonzero(charged | (current_A > switch_A))
-        changes = (np.flatnonzero(np.diff(rows["cycle"])) + 1).tolist()
+        counters = rows[[each for each in ("cycle", "test") if each in rows]]
+        changes = (np.flatnonzero(np.diff(counters, axis=0).any(axis=1)) + 1).tolist()
         for n, following in itertools.pairwise([*changes, len(rows)]):
             k = int(np.searchsorted(under_load, n))
             before, after = (int(each[0]) if len(each) else None for each in (under_load[:k][-1:], under_load[k : k + 1]))
@@ -355,7 +356,7 @@ def _with_count(shown: Shown, rows: pd.DataFrame) -> Shown:
         return shown
     part = slice(loaded[0], loaded[-1] + 1)
     if "lost" in rows:  # all of it in each step of the program, none, or any part in all alike
-        shown = shown._replace(uncounted_C=float(rows["lost"].to_numpy()[part][1:] @ np.abs(current_A[part][:-1])) / 3.0**0.5)
+        shown = shown._replace(uncounted_C=float(rows["lost"].to_numpy()[part][1:].sum()) / 3.0**0.5)
     if "capacity" not in rows or len(loaded) < LEAST_SAMPLES:
         return shown
     step_C = np.diff(rows["capacity"].to_numpy()[part])

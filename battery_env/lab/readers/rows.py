@@ -10,6 +10,7 @@ import itertools
 import re
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,8 @@ _LONG_SHARE = 0.25
 _STEP_S = 1e-3
 # What a clock may count in, s.
 _TICKS_S = (3600.0, 60.0, 1.0, 0.1, 0.01)
+# Numbers from here on may be dates in digits, as 20260227225000.
+_LEAST_DATE = 1e13
 _DAY_S = CLOCKS["days"][1]
 # What is so many times what is usual is not usual.
 _MANY_TIMES = 3.0
@@ -44,6 +47,14 @@ _MANY_TIMES = 3.0
 _DEAD_SHARE = 0.1
 # Temperatures that a cell may have, degC.
 _TEMPERATURES_C = (-60.0, 150.0)
+# Fractions behind a comma or a colon, days as in 1-02:03:04, 1.02:03:04, 1 day, 2:03:04, and of workbooks, which count from
+# 1900 on, and dates alone, which are midnight.
+_AS_CLOCKS = {
+    r"(?<=\d),(?=\d)|(?<=:\d\d:\d\d):(?=\d{3}$)": ".",
+    r"^(?:1900-01-(\d+)[ T]|(\d+)(?:[-.]| days?,? ))(?=\d+:)": r"\1\2 days ",
+    r"^(\d+([-./])\d+\2\d+)$": r"\1 00:00:00",
+}
+_BEGINS_AS_NUMBER = re.compile(r"\s*[-+.,]*\d")
 _THOUSANDS = re.compile(r"^\s*[-+]?\d{1,3}(?:[,.' ]\d{3})+(?:[.,]\d+)?\s*$")
 
 
@@ -52,7 +63,7 @@ def cells_of(table: pd.DataFrame, columns: Mapping[str, Column]) -> dict[str, pd
     The rows of each cell, of a table with columns by quantity as they were written, whose index counts the rows below the
     header; the name is empty where the table holds one cell.
     """
-    for mend in (without_blank_rows, without_headers, without_cut_line):
+    for mend in (without_blank_rows, without_words, without_cut_line):
         table = mend(table, columns)
     if len(table) < LEAST_SAMPLES:
         raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows below the header, got {len(table)}")
@@ -74,6 +85,7 @@ def mended(table: pd.DataFrame, columns: Mapping[str, Column], file_format: File
         without_repeated,
         on_one_clock,
         with_clock_going_on,
+        with_tests_apart,
         with_steps_apart,
         without_rows_out_of_time,
     ):
@@ -90,17 +102,28 @@ def without_blank_rows(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd
     return table[~table[_measured(table)].isna().all(axis=1)]
 
 
-def without_headers(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
-    """Without the header where it comes again, as in files that were put one behind the other, and what is said around it."""
-    measured = _measured(table)
-    if any(pd.api.types.is_numeric_dtype(table[each].dtype) for each in measured):
-        return table  # no name is among numbers
-    again = np.logical_and.reduce([table[each].astype(str).str.strip() == columns[each].name for each in measured])
-    if again.any():
-        _say(f"the header comes again, and is left out: row {_place(table, again)}")
-        words = table[measured].drop(columns="time").apply(pd.to_numeric, errors="coerce").isna().all(axis=1)
-        again = words & pd.Series(again, table.index).groupby((words != words.shift()).cumsum()).transform("any")
-    return table[~again]
+def without_words(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
+    """Without rows of words in place of the time, where few places have such: titles, summaries, headers that come again."""
+    time, measured = table["time"], _measured(table)
+    is_text = pd.api.types.is_object_dtype(time.dtype) or pd.api.types.is_string_dtype(time.dtype)
+    is_time = time.astype(str).str.match(_BEGINS_AS_NUMBER) if is_text else time.notna()
+    if is_time.all() or not is_time.mean() > 0.5:
+        return table
+    # what stands among them and is no measurement either, as the number of a cell, is none of a row
+    others = table[[each for each in measured if "time" not in each]].apply(pd.to_numeric, errors="coerce").isna().all(axis=1)
+    words = ~is_time & (time.notna() | others)
+    nothing = words | others
+    block = (nothing != nothing.shift()).cumsum()
+    nothing &= words.groupby(block).transform("any")
+    if not nothing.any() or block[nothing].nunique() > max(1.0, SWITCH_SHARE * len(table)):
+        return table
+    text = str(table.loc[words, measured].iloc[0].dropna().iloc[0]).strip()
+    _say(f"left out, as words stand for the time: row {_place(table, nothing.to_numpy())}, {text!r}")
+    kept = table[~nothing].copy()
+    for name in measured:
+        with suppress(ValueError, TypeError):  # words among numbers made text of all
+            kept[name] = pd.to_numeric(kept[name])
+    return kept
 
 
 def without_cut_line(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
@@ -187,6 +210,8 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
         is_finer = len(np.unique(values)) > len(np.unique(best))
         if _agree(best, values, quantity):
             best = values if is_finer else best
+        elif quantity == "time" and (refined_s := _refined(best, values)) is not None:
+            best = refined_s
         elif _goes_on_where(values, best):
             _say(f"the time is {other.name!r}, as {column.name!r} goes back")
             best = values
@@ -198,6 +223,18 @@ def _finest(table: pd.DataFrame, columns: Mapping[str, Column], quantity: str) -
         elif is_finer:
             _say(f"the time is {column.name!r}; {other.name!r} tells more rows apart, but is another clock")
     return best
+
+
+def _refined(coarse_s: FloatArray, fine_s: FloatArray) -> FloatArray | None:
+    """A coarse clock as a finer one tells it that starts anew, and agrees with it from each start to the next."""
+    ticks_s, part = np.diff(np.unique(coarse_s)), np.cumsum(np.diff(fine_s, prepend=fine_s[:1]) < 0.0)
+    if not len(ticks_s) or not part[-1]:
+        return None
+    off_s = pd.Series(coarse_s - fine_s).groupby(part)
+    low_s, high_s = off_s.transform("min").to_numpy(), off_s.transform("max").to_numpy()
+    refined_s = fine_s + 0.5 * (low_s + high_s)
+    is_finer = (np.diff(refined_s) > 0.0).sum() > (np.diff(coarse_s) > 0.0).sum() and (np.diff(refined_s) >= 0.0).all()
+    return refined_s if is_finer and (high_s - low_s <= (1.0 + _NOTHING_SHARE) * ticks_s.min()).all() else None
 
 
 def _goes_on_where(other_s: FloatArray, time_s: FloatArray) -> bool:
@@ -297,15 +334,20 @@ def _cycles(values: pd.Series, column: Column) -> FloatArray:
 def seconds(values: pd.Series, column: Column) -> FloatArray:
     """Numbers in their unit; a clock, hours:minutes:seconds, in seconds; dates in seconds since the earliest one."""
     if pd.api.types.is_numeric_dtype(values.dtype):
-        return numbers(values, column)
+        if not values.min() >= _LEAST_DATE:
+            return numbers(values, column)
+        dates = pd.to_datetime((values // 1).astype("Int64").astype("string"), format="%Y%m%d%H%M%S", errors="coerce")
+        return numbers(values, column) if dates.isna().any() else seconds(dates, column)
     if pd.api.types.is_datetime64_any_dtype(values.dtype):
         return (values - values.min()).dt.total_seconds().to_numpy(dtype=np.float64)
     if pd.api.types.is_timedelta64_dtype(values.dtype):
         return values.dt.total_seconds().to_numpy(dtype=np.float64)
-    if not values.dropna().astype(str).str.contains(":").all():
+    lines = "\n".join(map(str.strip, values.astype(str)))
+    for pattern, clock in _AS_CLOCKS.items() if ":" in lines else ():
+        lines = re.sub(pattern, clock, lines, flags=re.MULTILINE)
+    text = pd.Series(lines.split("\n"), index=values.index)
+    if not text[values.notna()].str.contains(":").all():
         return numbers(values, column)
-    # some count days as in 1-02:03:04
-    text = values.astype(str).str.strip().str.replace(",", ".").str.replace(r"^(\d+)-(?=\d+:)", r"\1 days ", regex=True)
     # UTC, as the clocks of a time zone are put forward and back
     readings: tuple[tuple[Callable[..., Any], dict[str, Any]], ...] = (
         (pd.to_timedelta, {}),
@@ -356,13 +398,26 @@ def without_dead_ends(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def without_missing(rows: pd.DataFrame) -> pd.DataFrame:
-    """Refuses rows in which a measurement is missing."""
-    for name in REQUIRED:
-        bad = np.flatnonzero(~np.isfinite(rows[name]))
-        if len(bad):
-            place = rows.index[bad[0]] + 1
-            raise ValueError(f"the {name} must be finite, got {rows[name].iloc[bad[0]]} in row {place}. Remove such rows.")
-    return rows
+    """
+    Without rows in which the voltage or the current is missing, if they are few, and what they drew is known but for little:
+    of a voltage it is, and of a current it is in doubt.
+    """
+    known = {name: np.isfinite(rows[name].to_numpy()) for name in REQUIRED}
+    kept = np.logical_and.reduce([*known.values()])
+    if kept.all():
+        return rows
+    place, current_A = np.arange(len(rows)), np.where(known["current"], rows["current"], 0.0)
+    beside_A = np.interp(place, place[kept], current_A[kept]) if kept.any() else current_A
+    worth_C = np.where(kept, 0.0, np.abs(current_A - beside_A) * np.abs(np.gradient(rows["time"])))
+    is_little = worth_C.sum() / 3.0**0.5 <= _FEW_SHARE * _passed_C(rows[kept])
+    for name, is_known in known.items():
+        if not is_known.all():
+            n = int(np.argmin(is_known))
+            if name == "time" or not is_little or (~kept).sum() > SWITCH_SHARE * len(rows):
+                got = rows[name].iloc[n]
+                raise ValueError(f"the {name} must be finite, got {got} in row {rows.index[n] + 1}. Remove such rows.")
+            _say(f"left out, as the {name} is missing: row {_place(rows, ~is_known)}")
+    return rows[kept].assign(lost=np.diff(np.cumsum(worth_C)[kept], prepend=0.0))
 
 
 def _changes(rows: pd.DataFrame, *names: str) -> BoolArray:
@@ -421,7 +476,8 @@ def on_one_clock(rows: pd.DataFrame) -> pd.DataFrame:
     lost_s[new], offsets_s[new] = np.where(is_end, 0.0, last_s), time_s[new - 1]
     unknown = f"; what passed in between, up to {lost_s.max():g} s each, is unknown" if lost_s.any() else ""
     _say(f"the time starts anew with each step, and is added up{unknown}")
-    return rows.assign(time=time_s + np.cumsum(offsets_s), lost=lost_s)
+    lost_C = lost_s * np.abs(np.roll(rows["current"], 1)) + (rows["lost"] if "lost" in rows else 0.0)
+    return rows.assign(time=time_s + np.cumsum(offsets_s), lost=lost_C)
 
 
 def with_clock_going_on(rows: pd.DataFrame) -> pd.DataFrame:
@@ -452,6 +508,28 @@ def without_repeated(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[~repeated]
 
 
+def with_tests_apart(rows: pd.DataFrame) -> pd.DataFrame:
+    """Where the clock starts anew, near where it began, while the cell rests, another test begins. Cycles are numbered on."""
+    time_s, step_s = rows["time"].to_numpy(), np.append(np.diff(rows["time"]), 0.0)
+    rests = (rows["current"].abs() <= _rest_A(rows["current"])).to_numpy()
+    cycle = rows["cycle"].to_numpy(copy=True) if "cycle" in rows else np.zeros(len(rows))
+    starts, few, usual_s = [0], int(max(1.0, _FEW_SHARE * len(rows))), float(np.median(step_s))
+    for n in (np.flatnonzero((step_s[:-1] < 0.0) & rests[:-1] & rests[1:] & (np.diff(cycle) <= 0.0)) + 1).tolist():
+        # rows out of time are few, and the clock goes on as before while the cell still rests
+        ends = (time_s[n : n + few + 1] >= time_s[n - 1]) | ~rests[n : n + few + 1]
+        goes_on = ends.any() and rests[n + int(np.argmax(ends))]
+        if not goes_on and time_s[n] <= time_s[starts[-1]] + _MANY_TIMES * max(usual_s, step_s[n]):
+            starts.append(n)
+    test = np.isin(np.arange(len(rows)), starts[1:])
+    if not test.any():
+        return rows
+    _say(f"the clock starts anew at rest, where another test begins: row {_place(rows, test)}")
+    for begin, end in itertools.pairwise([*starts, len(rows)]):
+        again = np.isin(np.unique(cycle[begin:end]), cycle[:begin]).any()
+        cycle[begin:end] += cycle[:begin].max() + 1.0 - cycle[begin:end].min() if again else 0.0
+    return rows.assign(test=np.cumsum(test), **({"cycle": cycle} if "cycle" in rows else {}))
+
+
 def with_steps_apart(rows: pd.DataFrame) -> pd.DataFrame:
     """Of two rows at one time, between which the step changes or the load is switched, the second is the later one."""
     time_s, jump_A = rows["time"].to_numpy(), np.diff(rows["current"], prepend=rows["current"].iloc[:1])
@@ -476,12 +554,12 @@ def _passed_C(rows: pd.DataFrame) -> float:
 def without_rows_out_of_time(rows: pd.DataFrame) -> pd.DataFrame:
     """
     Without rows that are not later than all before them, if they are few, or say what the others say, and if little charge
-    passes from each to the next, as all of that is lost where a clock was put back. A clock may start anew with a cycle.
+    passes from each to the next, as all of that is lost where a clock was put back. Cycles and tests may have own clocks.
     """
     time = rows["time"]
     if (np.diff(time) > 0.0).all():
         return rows
-    cycle = pd.Series(np.cumsum(_changes(rows, "cycle") & (np.diff(time, prepend=-np.inf) < 0.0)), index=rows.index)
+    cycle = pd.Series(np.cumsum(_changes(rows, "cycle", "test") & (np.diff(time, prepend=-np.inf) < 0.0)), index=rows.index)
     latest = time.groupby(cycle).cummax().groupby(cycle).shift()
     twice, back = (time == latest).to_numpy(), (time < latest).to_numpy()
     kept, few = rows[~(twice | back)], max(1.0, _FEW_SHARE * len(rows))
@@ -553,7 +631,10 @@ def _rest_A(current_A: pd.Series[float]) -> float:
 
 
 def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
-    """Refuse a current of one sign under which, once it has grown, the voltage rises for long, while elsewhere it falls."""
+    """
+    Refuse a current of one sign under which, once it has grown, the voltage rises for long, while elsewhere it falls; or with
+    which the voltage jumps up where a rest ends, while elsewhere it jumps down.
+    """
     size_A, voltage_V = rows["current"].abs().to_numpy(), rows["voltage"].to_numpy()
     jump_A = np.diff(size_A, prepend=0.0)
     begin = np.union1d([0], np.flatnonzero(np.abs(jump_A) > SWITCH_SHARE * size_A.max()))
@@ -567,6 +648,10 @@ def _refuse_unsigned(rows: pd.DataFrame, columns: Mapping[str, Column]) -> None:
     relaxes = (jump_A[begin] < 0.0) & (voltage_V[end] < before_V)
     rests = np.maximum.reduceat(size_A, begin) <= SWITCH_SHARE * size_A.max()
     rise_V[rests | ((~is_long | relaxes) & (rise_V > 0.0))] = 0.0
+    jump_V = voltage_V[np.minimum(begin + 1, end)] - voltage_V[np.maximum(begin - 1, 0)]
+    jump_V[rests | ~is_long | (begin == 0) | (size_A[begin - 1] > SWITCH_SHARE * size_A.max()) | (jump_V * rise_V < 0.0)] = 0.0
+    if min(jump_V.max(), -jump_V.min()) > _LONG_SHARE * np.abs(jump_V).max():
+        rise_V, long_V = jump_V, 0.0
     if rise_V.max() > long_V and np.minimum(rise_V, 0.0).sum() < -long_V:
         known = " and ".join(repr(column.name) for key, column in columns.items() if key.startswith("state"))
         raise ValueError(

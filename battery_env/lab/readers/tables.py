@@ -8,6 +8,7 @@ import gzip
 import io
 import itertools
 import lzma
+import operator
 import re
 import warnings
 import zipfile
@@ -34,17 +35,16 @@ _OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open
 # Testers write what they know about a test above the table: so many bytes are searched for its header.
 _HEAD_BYTES = 1 << 18
 _BLANKS = r"\s+"
-_DELIMITERS = (",", ";", "\t", _BLANKS)
+_DELIMITERS = (",", ";", "\t", "|", _BLANKS)
 _ITS_COMMA = re.compile(r"^(\s*[-+]?\d*),(?=\d)")
 _DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
 _NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
+_DATE, _CLOCK = re.compile(r"\d+([-./])\d+\1\d+$"), re.compile(r"\d+:\d\d")
 _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
 # What Excel reads in the first line of a file: the delimiter.
 _DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
 # Some testers put lines as a whole in quotes.
 _QUOTED_LINES = re.compile(rb'^"([^"\n]*)"\s*$', flags=re.MULTILINE)
-# So many lines below a table may be no part of it.
-_FOOT_LINES = 50
 # What is packed is read in parts of so many bytes, or rows.
 _CHUNK_BYTES, _BATCH_ROWS = 1 << 20, 1 << 16
 # A table is known by so many of its first rows.
@@ -64,6 +64,7 @@ class _Layout(NamedTuple):
     names: list[str]
     layers: int  # so many columns at the left number what lies above a row, as its cycle and its step
     rows: list[list[str]]  # fields of the first lines below the header
+    clock: int | None  # the column that goes on a date in the one before
 
 
 def read_columns(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
@@ -108,9 +109,9 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
     columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
     header_lines += bool(layout.rows) and are_units(layout.rows[0])
     # one column may serve as two quantities
-    positions = sorted({*range(layout.layers), *(column.position for column in columns.values())})
+    positions = sorted({*range(layout.layers), *filter(None, [layout.clock]), *(each.position for each in columns.values())})
 
-    def read(rows: int | None = None) -> pd.DataFrame:
+    def read() -> pd.DataFrame:
         try:
             found = pd.read_csv(
                 io.BytesIO(source) if isinstance(source, bytes) else source,
@@ -120,7 +121,6 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
                 header=None,
                 names=range(len(layout.names)) if layout.layers else None,
                 skiprows=header_lines,
-                nrows=rows,
                 usecols=positions,
                 index_col=False,
                 low_memory=False,
@@ -129,7 +129,9 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
             raise ValueError("there are no rows below the header") from error
         except Exception as error:  # pandas raises whatever the damage leads it to
             raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
-        # words among numbers make text of all
+        # words among numbers make text of all, as do signs of typographers
+        for column in {columns[quantity].position for quantity in ("voltage", "current") if quantity in columns}:
+            found[column] = found[column].replace("\u2212", "-", regex=True)
         return found if layout.decimal == "." else found.replace(_ITS_COMMA, r"\1.", regex=True)
 
     try:
@@ -143,18 +145,10 @@ def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFr
             raise
         warnings.warn("the last line is cut within quotes, and left out", stacklevel=2)
         return _read_text(kept.encode(layout.encoding), file_format)
-    measured = [
-        columns[quantity].position for quantity in ("voltage", "current", "power", "charge_step") if quantity in columns
-    ]
-    foot = 0 if layout.layers else _foot_lines(table[measured])
-    text = table[columns["time"].position].tail(foot).dropna().astype(str).str.strip()
-    if len(text):
-        warnings.warn(
-            f"lines below the table, which hold neither voltage nor current, are left out: {text.iloc[0]!r}", stacklevel=2
-        )
-        # once more, as text below a column makes text of it
-        table = read(len(table) - foot)
     table = _lowest_layer(table, layout.layers)
+    if layout.clock and layout.clock - 1 in table:
+        date, clock = (table[place].astype("string") for place in (layout.clock - 1, layout.clock))
+        table[layout.clock - 1] = date.str.cat(clock, sep=" ").astype(object)
     return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
 
 
@@ -186,12 +180,6 @@ def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
     return table[~above]
 
 
-def _foot_lines(measured: pd.DataFrame) -> int:
-    """How many of the last rows hold neither voltage nor current."""
-    nothing = measured.tail(_FOOT_LINES).apply(pd.to_numeric, errors="coerce").isna().all(axis=1).to_numpy()
-    return int(np.argmin(nothing[::-1])) if len(nothing) else 0
-
-
 def _check_archive(path: Path) -> None:
     """Refuse a file that holds an archive of what is far larger."""
     if zipfile.is_zipfile(path):
@@ -217,7 +205,8 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
     if stated := _DELIMITER_LINE.match(lines[0]):
         lines[0], delimiters = "", (stated[1],)
     number, delimiter = _header(lines, delimiters, chosen)
-    names, rows = _fields(lines[number], delimiter), [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
+    rows = [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
+    names, clock = _names(_fields(lines[number], delimiter, len(next(filter(None, rows), lines))), rows)
     layers = next((n for n, name in enumerate(names) if name), 0) if delimiter != _BLANKS else 0
     below = [any(row[:layers]) for row in rows if any(row)]
     if sum(below) >= 0.5 * len(below):
@@ -227,28 +216,62 @@ def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
         names[n] = above[-1] if above else ""
     values = [field for row in rows for field in row]
     commas, points = (sum(map(bool, map(mark.match, values))) for mark in (_DECIMAL_COMMA, _DECIMAL_POINT))
-    return _Layout(encoding, number, delimiter, "," if commas > points and delimiter != _BLANKS else ".", names, layers, rows)
+    return _Layout(
+        encoding, number, delimiter, "," if commas > points and delimiter != _BLANKS else ".", names, layers, rows, clock
+    )
+
+
+def _names(names: list[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], int | None]:
+    """The names with an empty one where most rows have one field more, of their number or of a clock, whose column is told."""
+    filled = [[*itertools.dropwhile(operator.not_, row[::-1])][::-1] for row in rows if any(row)]
+    wider = [row for row in filled if len(row) > len(names)]
+    if len(wider) <= 0.5 * len(filled):
+        return names, None
+    if all(len(row) == len(names) + 1 for row in wider):
+        if [row[0] for row in wider] == [*map(str, range(1, len(wider) + 1))]:
+            return ["", *names], None
+        for n, fields in enumerate(itertools.pairwise(zip(*wider, strict=True)), start=1):
+            if all(map(_DATE.match, fields[0])) and all(map(_CLOCK.match, fields[1])):
+                return [*names[:n], "", *names[n:]], n
+    if not any(_count_numbers(row[len(names) :]) for row in wider):  # remarks
+        return names, None
+    raise ValueError(
+        f"rows have {len(wider[0])} fields below {len(names)} names, which does not tell what is what: name each column, and "
+        "take another delimiter than the decimal comma"
+    )
 
 
 def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str, str] | None) -> tuple[int, str]:
     """The line with the names of the columns, and the delimiter."""
-    best, found = (0, delimiters[0]), -1
-    for number, line in enumerate(lines):
-        next_line = next(filter(str.strip, itertools.islice(lines, number + 1, None)), "")
-        for delimiter in delimiters:
-            names = _fields(line, delimiter)
-            # blanks within names, or in a sentence
-            if delimiter == _BLANKS and (len(_fields(next_line, delimiter)) < len(names) or _count_numbers(names)):
-                continue
-            if (count := count_required(names, chosen)) > found:
-                best, found = (number, delimiter), count
-        if found == len(REQUIRED):
-            break
-    if found > 0:
-        return best
     filled = [number for number, line in enumerate(lines) if line.strip()]
     if not filled:
         raise ValueError("the file is empty")
+    best: dict[tuple[str, ...], tuple[int, str]] = {}
+    found = 1
+    for number, below in itertools.pairwise([*filled, filled[-1]]):
+        for delimiter in delimiters:
+            most = len(_fields(lines[below], delimiter)) if delimiter == _BLANKS else np.inf
+            names = _fields(lines[number], delimiter, most)
+            has_numbers = _count_numbers(names) > 0
+            # blanks within names, or in a sentence
+            if (delimiter == _BLANKS and len(names) > most) or (
+                has_numbers and (delimiter == _BLANKS or found == len(REQUIRED))
+            ):
+                continue
+            count = count_required(names, chosen)
+            if count > found:
+                best, found = {}, count
+            if count == found and (not best or not has_numbers):
+                best.setdefault(tuple(filter(None, names)), (number, delimiter))
+            if found == len(REQUIRED):
+                delimiters = (delimiter,)
+                break
+    if best:
+        first, *others = best.values()
+        header = max([first, *others], key=lambda each: _fit(lines, *each)) if others else first
+        if header != first:
+            warnings.warn(f"the header is line {header[0] + 1}; the table of line {first[0] + 1} is left out", stacklevel=2)
+        return header
     # names come apart as often as the first numbers below them
     for above, number in itertools.pairwise([-1, *filled]):
         apart = [each for each in delimiters if _count_numbers(_fields(lines[number], each)) > 1]
@@ -260,6 +283,14 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
         if apart:
             raise ValueError("there is no line with the names of the columns above the numbers. Add one")
     return filled[0], delimiters[0]
+
+
+def _fit(lines: Sequence[str], number: int, delimiter: str) -> int:
+    """How well the lines below a header hold numbers in as many fields as it has names; a delimiter may end each."""
+    rows = [_fields(line, delimiter) for line in lines[number + 1 :]]
+    width = len(_fields(lines[number], delimiter, max(map(len, rows), default=0)))
+    filled = [len([*filter(None, row)]) if _count_numbers(row) > 1 else -1 for row in rows]
+    return sum(2 * (count >= 0 and len(row) == width) or count == width for row, count in zip(rows, filled, strict=True))
 
 
 def _count_numbers(fields: Sequence[str]) -> int:
@@ -280,11 +311,11 @@ def _decoded(head: bytes) -> tuple[str, str]:
         return encoding, head.decode(encoding, errors="ignore")
 
 
-def _fields(line: str, delimiter: str) -> list[str]:
+def _fields(line: str, delimiter: str, most: float = np.inf) -> list[str]:
     # numpy writes a header as a comment
     line = line.lstrip("# ")
-    if delimiter == _BLANKS:
-        return line.split()
+    if delimiter == _BLANKS:  # of which two or more part names of several words
+        return fields if len(fields := line.replace('"', " ").split()) <= most else re.split(r"\s{2,}", line.strip())
     try:
         return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
     except csv.Error:
@@ -315,15 +346,25 @@ def _sheet(path: Path, file_format: FileFormat) -> bytes:
     found = []
     for sheet in sheets.values():
         head = [[str(name) for name in row] for row in sheet.head(_FIRST_ROWS).to_numpy()]
-        counts = [count_required(names, file_format.columns) for names in head] or [0]
-        line = int(np.argmax(counts))
-        found.append((counts[line], len(sheet), head[line : line + 1], line, sheet))
+        known = [count_required(names, file_format.columns) for names in head] or [0]
+        line = int(np.argmax(known))
+        found.append((known[line], len(sheet), head[line : line + 1], line, sheet))
     names = max(found, key=lambda each: each[:2])[2]
     (top, first), *others = [(line, sheet) for *_, each, line, sheet in found if each == names]
-    parts = [first, *(sheet.iloc[line + 1 :] for line, sheet in others)]
-    if others and not has("cycle", [name for row in names for name in row]):  # each may be a test of its own
+    parts, header = [first, *(sheet.iloc[line + 1 :] for line, sheet in others)], [name for row in names for name in row]
+    if others and not has("cycle", header):  # each may be a test of its own
         parts = [part.assign(cycle=str(number)) for number, part in enumerate(parts, start=1)]
         parts[0].iloc[top, -1] = "Cycle"
+    elif others and not has("cell", header):  # each whose clock and cycles do not go on is a cell of its own
+        columns = find_columns(header, file_format, ())
+        places = [columns[each].position for each in ("time", "cycle") if each in columns]
+        counts = [part.iloc[:, places].apply(pd.to_numeric, errors="coerce").dropna() for part in parts]
+        if all(len(each) and each.iloc[:, 0].is_monotonic_increasing for each in counts):
+            anew = [True, *((after.iloc[0] <= before.iloc[-1]).all() for before, after in itertools.pairwise(counts))]
+            titles = pd.Series([title for title, each in zip(sheets, found, strict=True) if each[2] == names])
+            cells = titles.where(pd.Series(anew)).ffill()
+            parts = [part.assign(cell=cell) for part, cell in zip(parts, cells, strict=True)]
+            parts[0].iloc[top, -1] = "Cell"
     return pd.concat(parts).to_csv(header=False, index=False).encode()
 
 
