@@ -394,7 +394,7 @@ class TestCommand:
         record = Discharge(made.time_s[::10], made.voltage_V[::10], made.current_A[::10])
         for share in (0.1, 0.25, 0.5, 0.75):
             found = calibrate_record(record.until(share * made.time_s[-1]))
-            # hundreds of standard deviations, were a prior around a new 18650 all that there is
+            # 5 to hundreds, were a prior around a new 18650 all that there is
             assert abs(found.predicted_eod_time_s - made.time_s[-1]) < 4.0 * found.sd_predicted_eod_time_s, share
 
     def test_a_life_tells_more_of_its_own_load_than_of_any_other(self):
