@@ -27,7 +27,6 @@ from battery_env.records import Samples, Shown, check_drawn_charge, check_record
 from battery_env.records.model import RecordModel
 from battery_env.tasks.env import CalibrationEnv, task_class
 from battery_env.tasks.task import CalibrationTask
-from battery_env.tasks.voltage.aging import BatteryAging
 from battery_env.tasks.voltage.fit import Fitted
 from battery_env.tasks.voltage.task import VoltageTask
 
@@ -166,7 +165,7 @@ class PolicyEstimator(OnlineEstimator):
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
-        if not issubclass(self.task_class, VoltageTask) or issubclass(self.task_class, BatteryAging):
+        if not issubclass(self.task_class, VoltageTask) or self.task_class.discharges_of_an_episode(self.options) > 1:
             raise ValueError(f"a policy of {self.env_id} takes no stream: it needs the full state, or a whole life")
         if temperature_C is not None:
             raise ValueError("a policy takes no temperature: its model is isothermal. Leave temperature_C out.")

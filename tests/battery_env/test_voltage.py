@@ -306,3 +306,15 @@ class TestAging:
             CalibrationEnv(BatteryAging, dataset=lives, cycles=5)
         with pytest.raises(TypeError, match="episode_steps"):
             CalibrationEnv(BatteryAging, dataset=lives, episode_steps=3)
+        with pytest.raises(ValueError, match="cycles = 4 needs a dataset"):
+            CalibrationEnv(BatteryVoltageJoint, cycles=4)
+
+    def test_any_voltage_task_goes_through_lives(self, lives):
+        options = {"start": "new_cell", "new_readings": (10, 60), "dataset": lives, "cycles": 4}
+        joint, qmax = (CalibrationEnv(each, episode_steps=2, **options) for each in (BatteryVoltageJoint, BatteryVoltageQmax))
+        aging = CalibrationEnv(BatteryAging, dataset=lives, cycles=4, decisions_per_cycle=2)
+        np.testing.assert_array_equal(joint.reset(seed=0)[0], aging.reset(seed=0)[0])
+        qmax.reset(seed=0)
+        for decision in range(8):
+            ended = [env.step(np.full(env.action_space.shape, -0.3, np.float32))[3] for env in (joint, aging, qmax)]
+            assert ended == [decision == 7] * 3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Literal
@@ -13,7 +13,7 @@ import numpy as np
 from battery_env.electrochemistry import CellParameters, FloatArray
 from battery_env.estimators.estimator import Record
 from battery_env.loads import RandomPiecewise
-from battery_env.tasks.task import Generators, Rows, check_counts
+from battery_env.tasks.task import check_counts
 from battery_env.tasks.voltage.task import VoltageTask
 from battery_env.trajectories import TrajectoryDataset
 
@@ -104,7 +104,7 @@ class BatteryAging(VoltageTask):
         dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **others: Any,
     ) -> None:
-        check_counts(cycles=cycles, decisions_per_cycle=decisions_per_cycle)
+        check_counts(cycles=cycles)
         if split not in LIVES:
             raise ValueError(f"split must be one of {tuple(LIVES)}, got {split!r}")
         if dataset is None:
@@ -113,20 +113,14 @@ class BatteryAging(VoltageTask):
             self._refuse_beside_a_dataset(split=split)
         super().__init__(
             cells,
-            episode_steps=cycles * decisions_per_cycle,
+            episode_steps=decisions_per_cycle,
+            cycles=cycles,
             new_readings=new_readings,
             start=start,
             cell=cell,
             dataset=dataset,
             **others,
         )
-        if len(self.readings) % cycles:
-            raise ValueError(f"{len(self.readings)} discharges are no whole number of lives of {cycles} cycles")
-        self.cycles, self.decisions_per_cycle = cycles, decisions_per_cycle
-        self.observation_size += len(self.parameters)
-        self._carried = self._estimate.copy()
-        # of the episodes; none on whole records, where nothing is drawn
-        self._generators: list[np.random.Generator | None] = [None] * cells
 
     @classmethod
     def options(cls) -> dict[str, Any]:
@@ -134,51 +128,3 @@ class BatteryAging(VoltageTask):
         decided = ("episode_steps", "load", "dt_s", "mismatch", "nuisance", "path")
         inherited = {name: default for name, default in VoltageTask.options().items() if name not in decided}
         return {**inherited, **super(VoltageTask, cls).options()}
-
-    def start(self, rows: Rows, generators: Generators, options: Mapping[str, Any] | None = None) -> None:
-        """Begin new lives."""
-        discharge = (options or {}).get("discharge", 0)
-        if discharge % self.cycles:
-            raise ValueError(f"options['discharge'] must be the first of a life of {self.cycles} cycles, got {discharge}")
-        for row, generator in zip(rows, generators, strict=True):
-            # later cycles need randomness when the agent gets there; the generator of the cell is not to be drawn from then
-            self._generators[row] = np.random.default_rng(generator.integers(2**63))
-        super().start(rows, generators, options)
-        self._carried[rows] = self._estimate[rows]
-
-    def _draw_discharge(self, generator: np.random.Generator) -> int:
-        return self.cycles * int(generator.integers(len(self.readings) // self.cycles))
-
-    @classmethod
-    def follow(cls, records: Sequence[Record], decision_s: float, **options: Any) -> BatteryAging:
-        """Go through whole lives, each with a cell of its own; see :meth:`VoltageTask.follow`."""
-        task = super().follow(records, decision_s, **options)
-        assert isinstance(task, BatteryAging)
-        task._carried = task._estimate.copy()
-        return task
-
-    @classmethod
-    def discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
-        """How many discharges an episode goes through."""
-        return int(options.get("cycles", cls.options()["cycles"]))
-
-    @property
-    def _decisions_in_a_discharge(self) -> int:
-        return self.decisions_per_cycle
-
-    def _draw_count(self, length: int, generator: np.random.Generator) -> int:
-        return min(int(generator.integers(*self.new_readings, endpoint=True)), length)
-
-    def _arrive(self) -> None:
-        """New readings, or after the last decision of a cycle those of the next one."""
-        super()._arrive()
-        goes_on = (self._step_of_episode >= self._last_step) & (self.discharge % self.cycles < self.cycles - 1)
-        for row in np.flatnonzero(goes_on).tolist():
-            discharge, generator = int(self.discharge[row]) + 1, self._generators[row]
-            self._carried[row] = self._estimate[row]
-            self._place(row, discharge, self._first_count(discharge, generator), self._estimate[row])
-            if generator is not None:
-                self._measure(row, discharge, generator)
-
-    def _parts(self) -> list[FloatArray]:
-        return [*super()._parts(), self._scaled(self._carried)]

@@ -92,6 +92,7 @@ class VoltageTask(CalibrationTask):
         cells: int,
         *,
         episode_steps: int = 8,
+        cycles: int = 1,
         reading_s: float | tuple[float, float] = 10.0,
         new_readings: tuple[int, int] = (0, 29),
         process_noise_V: float = 0.0,
@@ -108,7 +109,7 @@ class VoltageTask(CalibrationTask):
         dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **sensors: Any,
     ) -> None:
-        check_counts(episode_steps=episode_steps)
+        check_counts(episode_steps=episode_steps, cycles=cycles)
         check_not_negative(consistency=consistency, process_noise_V=process_noise_V, nuisance=nuisance)
         if not 0 <= new_readings[0] <= new_readings[1]:
             raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
@@ -124,8 +125,13 @@ class VoltageTask(CalibrationTask):
                     "take a task that looks for both"
                 )
         chosen = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
+        if cycles > 1 and dataset is None:
+            raise ValueError(f"cycles = {cycles} needs a dataset with the discharges of whole lives, life after life")
         self._open(dataset, reading_s, cell, path, chosen)
-        self.cells, self.episode_steps, self.new_readings = cells, episode_steps, new_readings
+        if len(self.readings) % cycles:
+            raise ValueError(f"{len(self.readings)} discharges are no whole number of lives of {cycles} cycles")
+        self.cells, self.cycles, self.new_readings = cells, cycles, new_readings
+        self.episode_steps, self._steps_of_a_discharge = cycles * episode_steps, episode_steps
         self.sensors = replace(SENSORS, **sensors)
         self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
         self.decision_s = self.readings.interval_s * (sum(new_readings) / 2.0)
@@ -137,7 +143,8 @@ class VoltageTask(CalibrationTask):
                 f"cost='state' is the error of a state that only a simulation knows, and {is_unknown.sum()} of "
                 f"{len(is_unknown)} discharges are not simulated: take cost='misfit' for recorded ones"
             )
-        self.observation_size = 6 * STRETCHES + 4 + len(self.parameters) * (2 if consistency > 0.0 else 1)
+        shown_numbers = 1 + (consistency > 0.0) + (cycles > 1)
+        self.observation_size = 6 * STRETCHES + 4 + len(self.parameters) * shown_numbers
         self.path, self._fit = path, None
         if nuisance > 0.0 or path is not None:
             prior = (
@@ -200,6 +207,9 @@ class VoltageTask(CalibrationTask):
         self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
         self._last_step: IntArray = np.zeros(cells, dtype=np.int64)  # of the discharge
         self._estimate = np.tile(self._new, (cells, 1))
+        self._carried = self._estimate.copy()  # into the discharge
+        # of the cycles to come, which are measured when the agent gets there; none on whole records, where nothing is drawn
+        self._later: list[np.random.Generator | None] = [None] * cells
         self._action = np.zeros((cells, len(self.parameters)))
         self._shown = np.zeros((SHOWN, cells, longest))
         # of the residual, V, of dV/dq_mobile, V/C, and of the ohmic drop per ohm, A
@@ -241,13 +251,18 @@ class VoltageTask(CalibrationTask):
             )
         if discharge is not None and not 0 <= discharge < len(self.readings):
             raise ValueError(f"options['discharge'] must lie within 0 .. {len(self.readings) - 1}, got {discharge!r}")
+        if discharge is not None and discharge % self.cycles:
+            raise ValueError(f"options['discharge'] must be the first of a life of {self.cycles} cycles, got {discharge}")
         for name in first:
             low, high = ESTIMATE_RANGES[name]
             if not low <= first[name] <= high:
                 raise ValueError(f"options['{name}_hat'] must lie within {low:g} .. {high:g}, got {first[name]!r}")
         fewest, most = self.new_readings
         for row, generator in zip(rows, generators, strict=True):
-            n = self._draw_discharge(generator) if discharge is None else int(discharge)
+            if self.cycles > 1:  # the generator of the cell is not to be drawn from later
+                self._later[row] = np.random.default_rng(generator.integers(2**63))
+            lives = len(self.readings) // self.cycles
+            n = self.cycles * int(generator.integers(lives)) if discharge is None else int(discharge)
             length = int(self.readings.count[n])
             count = self._first_count(n, generator) if reading is None else int(reading)
             if not 1 <= count <= length:
@@ -262,14 +277,13 @@ class VoltageTask(CalibrationTask):
         self._action[rows] = 0.0
         self._explain(rows)
 
-    def _draw_discharge(self, generator: np.random.Generator) -> int:
-        return int(generator.integers(len(self.readings)))
-
     def _first_count(self, discharge: int, generator: np.random.Generator | None) -> int:
-        """How many readings there are at first: on a whole record as many as arrive between two decisions."""
+        """How many readings there are at first: any number, or in a life and on a whole record those of one decision."""
         if generator is None:
             return int(self._due(discharge)[0])
-        return self._draw_count(int(self.readings.count[discharge]), generator)
+        length = int(self.readings.count[discharge])
+        fewest, most = (_FEWEST_READINGS, length) if self.cycles == 1 else self.new_readings
+        return min(int(generator.integers(fewest, most, endpoint=True)), length)
 
     def _due(self, discharge: int) -> IntArray:
         """How many readings each decision on a whole record knows: two at least."""
@@ -277,9 +291,6 @@ class VoltageTask(CalibrationTask):
         first, last = (max(int(np.ceil(at_s / self._every_s - 1e-9)), 1) for at_s in time_s[[1, -1]])
         due_s = self._every_s * np.arange(first, last + 1) * (1.0 + 1e-9)
         return np.asarray(np.searchsorted(time_s, due_s, side="right"), dtype=np.int64)
-
-    def _draw_count(self, length: int, generator: np.random.Generator) -> int:
-        return int(generator.integers(_FEWEST_READINGS, length, endpoint=True))
 
     @classmethod
     def follow(cls, records: Sequence[Record], decision_s: float, **options: Any) -> VoltageTask:
@@ -303,7 +314,7 @@ class VoltageTask(CalibrationTask):
     @classmethod
     def discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
         """How many discharges an episode goes through."""
-        return 1
+        return int(options.get("cycles", cls.options()["cycles"]))
 
     def seen(self) -> tuple[IntArray, FloatArray]:
         """Which readings the next decision knows."""
@@ -335,19 +346,15 @@ class VoltageTask(CalibrationTask):
         length = self.readings.count[discharge]
         self.discharge[row], self.count[row] = discharge, count
         self._shown[:, row, :length] = self.readings.shown(discharge)
-        self._estimate[row] = estimate
+        self._estimate[row] = self._carried[row] = estimate
         if self._fit is not None:
             self._fit.start(row)
-        decisions, step = self._decisions_in_a_discharge, self._step_of_episode[row]
+        decisions, step = self._steps_of_a_discharge, self._step_of_episode[row]
         if self._every_s:
             due = self._due(discharge)
             decisions = len(due)
             self._arrivals[row, step : step + decisions - 1] = np.diff(due)
         self._last_step[row] = step + decisions
-
-    @property
-    def _decisions_in_a_discharge(self) -> int:
-        return self.episode_steps
 
     def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
         estimate = self._known[discharge].copy()
@@ -419,6 +426,7 @@ class VoltageTask(CalibrationTask):
             self._scaled(self._estimate),
             *([self._action] if self.consistency > 0.0 else []),
             *([] if self._fit is None else self._fit.parts(self._step, self._high - self._low)),
+            *([self._scaled(self._carried)] if self.cycles > 1 else []),
         ]
 
     def _scaled(self, estimate: FloatArray) -> FloatArray:
@@ -445,10 +453,17 @@ class VoltageTask(CalibrationTask):
         return np.asarray(np.linalg.norm(self._estimate / self._known[self.discharge] - 1.0, axis=1))
 
     def _arrive(self) -> None:
+        """New readings, or after the last decision of a cycle those of the next one."""
         step = np.minimum(self._step_of_episode, self._arrivals.shape[1] - 1)
         arrived = self._arrivals[np.arange(self.cells), step]
         self.count = np.minimum(self.count + arrived, self.readings.count[self.discharge])
         self._step_of_episode += 1
+        goes_on = (self._step_of_episode >= self._last_step) & (self.discharge % self.cycles < self.cycles - 1)
+        for row in np.flatnonzero(goes_on).tolist():
+            discharge, generator = int(self.discharge[row]) + 1, self._later[row]
+            self._place(row, discharge, self._first_count(discharge, generator), self._estimate[row])
+            if generator is not None:
+                self._measure(row, discharge, generator)
 
     def truncated(self) -> NDArray[np.bool_]:
         """Whose episode is over. An episode goes on after the last reading: the estimate may still be moved."""
