@@ -90,8 +90,9 @@ TRAINING_CELLS, UPDATES = 700, 2500
 NETWORKS = "dict(net_arch=[64, 64], activation_fn=nn.LeakyReLU)"
 # What the filter takes for the error of a model with the mean constants of a path, V: chosen on B0005.
 _MEAN_CELL_MISMATCH_V = 0.02
-# A regression knows so many voltages, and how much it is held back: chosen on B0005.
-_VOLTAGES, _RIDGE = 16, 0.001
+# A regression knows so many steps of the voltage, and how much it is held back: chosen on B0005. It knows steps and not
+# voltages, as the level of the voltage is another one in each cell.
+_STEPS, _RIDGE = 16, 0.001
 
 
 class Loads(RandomLoad):
@@ -138,7 +139,7 @@ def part(judged: str, every: int, folder: Path, method: str | None = None, **pol
     if method is not None:
         return learned(judged, every, method, folder=folder, **policies)
     life = CELLS[judged]
-    path, discharges = path_of([life], folder)[0], load_nasa_discharges(judged)
+    (path, own_path), discharges = (path_of([cell], folder)[0] for cell in (life, judged)), load_nasa_discharges(judged)
     labelled = load_nasa_discharges(life)
     settings = {OWN_LIFE: Settings(cut_off_V=CUT_OFF_V), BOTH.format(life): Settings.for_cell(path, cut_off_V=CUT_OFF_V)}
     lives = {name: track_life(discharges, CUT_OFF_V, _least_squares(each)) for name, each in settings.items()}
@@ -146,6 +147,7 @@ def part(judged: str, every: int, folder: Path, method: str | None = None, **pol
     for n in range(1, len(discharges), every):
         whole = _Whole(discharges[n])
         rows += _said(path, life, labelled, whole, discharges[n - 1])
+        rows += _along(own_path, PATH.format(judged), whole)
         for method, each in settings.items():
             rows += _with_own_life(method, each, lives[method].after(n), whole)
     return {"discharges": pd.DataFrame(rows).assign(cell=judged)}
@@ -208,18 +210,23 @@ def _said(
     path: AgingPath, life: str, labelled: Sequence[Discharge], whole: _Whole, last: Discharge
 ) -> Iterator[dict[str, object]]:
     """What each method says of a discharge at each share of its time."""
-    for share in SHARES:
+    yield from _along(path, PATH.format(life), whole)
+    for share in SHARES[:-1]:
         seen = whole.seen(share)
         record = seen.loaded_part(CUT_OFF_V)
-        yield {"method": PATH.format(life), **_row(path, whole, share, record, LeastSquares(path=path).estimate(record))}
-        if share == 1.0:
-            continue
         yield {"method": KALMAN.format(life), **_row(path, whole, share, record, *_filtered(path, record))}
         ahead = forecast_end(seen, Settings(cut_off_V=CUT_OFF_V))
         yield {"method": FILTER, "share": share, **_end(whole, ahead.eod_quantile_s(BAND))}
         yield {"method": LABELLED.format(life), "share": share, "error_percent": _regression(labelled, whole, record)}
         lasted_s = last.eod_time_s(CUT_OFF_V) - last.load_on_time_s
         yield {"method": LAST, "share": share, "error_percent": whole.off(whole.start_s + lasted_s)}
+
+
+def _along(path: AgingPath, method: str, whole: _Whole) -> Iterator[dict[str, object]]:
+    """What least squares say of a discharge along a path."""
+    for share in SHARES:
+        record = whole.seen(share).loaded_part(CUT_OFF_V)
+        yield {"method": method, **_row(path, whole, share, record, LeastSquares(path=path).estimate(record))}
 
 
 def _filtered(path: AgingPath, record: Discharge) -> tuple[Estimate, float]:
@@ -253,21 +260,22 @@ def _regression(labelled: Sequence[Discharge], whole: _Whole, record: Discharge)
     charge_C = record.charge_C
     loaded = [each.loaded_part(CUT_OFF_V) for each in labelled]
     usable = [each for each in loaded if each.charge_C > charge_C]
-    features = np.array([_voltages(each, charge_C) for each in usable])
+    features = np.array([_steps_V(each, charge_C) for each in usable])
     targets = np.log([each.charge_C for each in usable])
     mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-6
     scaled = (features - mean) / spread
-    held = _RIDGE * len(usable) * np.eye(_VOLTAGES)
+    held = _RIDGE * len(usable) * np.eye(_STEPS)
     weights = np.linalg.solve(scaled.T @ scaled + held, scaled.T @ (targets - targets.mean()))
-    told_C = float(np.exp(targets.mean() + (_voltages(record, charge_C) - mean) / spread @ weights))
+    told_C = float(np.exp(targets.mean() + (_steps_V(record, charge_C) - mean) / spread @ weights))
     capacity_C = whole.discharge.loaded_part(CUT_OFF_V).charge_C
     return 100.0 * (told_C / capacity_C - 1.0)
 
 
-def _voltages(record: Discharge, charge_C: float) -> FloatArray:
-    """The voltage at equal steps of charge, up to one."""
+def _steps_V(record: Discharge, charge_C: float) -> FloatArray:
+    """How far the voltage falls over equal steps of charge, up to one."""
     drawn_C = drawn(record.time_s, record.current_A, record.time_s)
-    return np.interp(charge_C * (np.arange(_VOLTAGES) + 0.5) / _VOLTAGES, drawn_C - drawn_C[0], record.voltage_V)
+    at_C = charge_C * (np.arange(_STEPS + 1) + 0.5) / (_STEPS + 1)
+    return np.diff(np.interp(at_C, drawn_C - drawn_C[0], record.voltage_V))
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:

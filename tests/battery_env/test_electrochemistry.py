@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from battery_env import NEW_CELL, CellParameters, initial_state, simulate, step, voltage
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, advance_in_place, state_of_charge, step_into, voltage_into
+from battery_env.electrochemistry.cell import new_cell_of
 
 # Tb, Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V of a new cell, dt 1 s
 REFERENCE_2A_THERMAL = {
@@ -43,6 +44,15 @@ def test_reference_trajectories_to_all_printed_digits(load, load_unit, thermal, 
     for t, expected in reference.items():
         found = [*discharge.state[t], discharge.voltage_V[t]]
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=5.1e-7, err_msg=f"t = {t}")
+
+
+@pytest.mark.parametrize("size", [0.2, 4.0, 30.0])
+def test_a_cell_of_another_size_has_the_same_voltage_and_temperature_at_as_much_more_current(size):
+    other = new_cell_of(size * NEW_CELL.q_mobile)
+    cells = ((NEW_CELL, 2.0), (other, 2.0 * size))
+    one, same = (simulate(amperes, load_unit="current", thermal=True, cell=cell) for cell, amperes in cells)
+    np.testing.assert_allclose(same.voltage_V, one.voltage_V, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(same.state[:, 0], one.state[:, 0], rtol=1e-9)
 
 
 def test_agrees_with_progpy_on_random_cells_and_loads():

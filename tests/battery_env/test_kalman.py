@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from battery_env import NEW_CELL, ExtendedKalmanFilter, SensorErrors, TrajectoryDataset, simulate
+from battery_env import NEW_CELL, Discharge, ExtendedKalmanFilter, SensorErrors, TrajectoryDataset, simulate
 from battery_env.estimates import EstimateTrace
 from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
 from battery_env.estimators.estimator import OnlineEstimator
@@ -112,7 +112,10 @@ class TestGuards:
 class TestOnline:
     def test_updates_and_traces_agree(self):
         records = [measured(seed=n, q_mobile=q).part(0, 700) for n, q in enumerate((7000.0, 4000.0))]
-        filter_ = ExtendedKalmanFilter()
+        # and in a cold room, which tells the temperature around the cell
+        part = records[0]
+        records.append(Discharge(part.time_s, part.voltage_V, part.current_A, np.full(700, 5.0), starts_at_rest=True))
+        filter_ = ExtendedKalmanFilter(thermal=True)
         batch, single = filter_.trace(records), [OnlineEstimator.follow(filter_, record) for record in records]
         for one, other in zip(batch, single, strict=True):
             for name in (field.name for field in fields(EstimateTrace)):

@@ -64,6 +64,16 @@ class TestSamples:
         with pytest.raises(ValueError, match=r"within 0.001 .. 604800 s"):
             estimator.update(4.0, 0.0, 700_000.0)
 
+    def test_charge_that_was_drawn_may_be_put_back_and_no_more(self, make):
+        estimator = make()
+        estimator.update(4.19, 2.0, 0.0)
+        estimator.update(4.0, -1.0, 600.0)
+        for _ in range(2):
+            estimator.update(4.1, -1.0, 600.0)  # 1200 C were drawn
+        estimator.update(4.19, -2.0, 60.0)
+        with pytest.raises(ValueError, match="current_A is positive in discharge, but this record draws -"):
+            estimator.update(4.19, -2.0, 600.0)
+
     def test_charge_that_flows_back_is_modelled_and_an_overcharge_is_refused(self):
         load_A = np.where(np.arange(20_000) % 300 < 200, 2.5, -1.0)
         estimate = follow(ExtendedKalmanFilter(thermal=True), measured(load_A))
