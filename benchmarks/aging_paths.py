@@ -317,7 +317,8 @@ def plot(rows: pd.DataFrame) -> Figure:
     figure, panels = new_panels(len(CELLS), 2, (4.6, 4.0))
     for axes, (cell, of_cell) in zip(panels, shown.groupby("cell"), strict=True):
         along = f", path of {CELLS[cell]}"
-        for colour, (method, group) in coloured(of_cell.groupby("method", sort=False)):
+        others = of_cell[of_cell["method"] != PATH.format(cell)]
+        for colour, (method, group) in coloured(others.groupby("method", sort=False)):
             axes.plot(range(len(group)), group["error_percent"], ".-", color=colour, lw=0.8, label=method.replace(along, ""))
         axes.axhline(0.0, color="black", lw=0.6)
         axes.set(title=cell + along, xlabel="discharge, from young to old", ylabel="error of the end, half seen (%)")
@@ -379,7 +380,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             asked.append({**of_cell, "method": f"{name}, {len(chosen.seeds)} as one", "algo": algo, "seeds": chosen.seeds})
     table = study.run(part, asked, folder=study.out)["discharges"]
     shown = summary(table)
-    if chosen.export:
+    if chosen.export and not study.redraws:
         export(chosen.seeds, study.out, study.command, shown)
     study.write({"discharges": table}, {"ends": plot(table)}, markdown(shown))
 
