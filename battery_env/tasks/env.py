@@ -82,7 +82,7 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.render_mode = check_render_mode(render_mode)
         self.task = new_task(task, 1, options)
         self.observation_space, self.action_space = spaces_of(self.task)
-        self._history: deque[dict[str, float]] = deque(maxlen=self.task.episode_steps)
+        self._history: deque[dict[str, float]] = deque(maxlen=int(self.task.episode_steps))
 
     @property
     def dataset(self) -> Sequence[Record]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from battery_env.checks import check_whole_number
 from battery_env.electrochemistry import FloatArray
 from battery_env.estimators.estimator import Record
 from battery_env.trajectories import IntArray
@@ -27,7 +28,7 @@ OBSERVATION_LIMIT = 100.0
 def check_counts(**values: int) -> None:
     """Refuse numbers of things that there must be."""
     for name, value in values.items():
-        if not value >= 1:
+        if check_whole_number(name, value) < 1:
             raise ValueError(f"{name} must be at least 1, got {value!r}")
 
 

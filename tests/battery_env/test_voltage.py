@@ -306,15 +306,17 @@ class TestAging:
             CalibrationEnv(BatteryAging, dataset=lives, cycles=5)
         with pytest.raises(TypeError, match="episode_steps"):
             CalibrationEnv(BatteryAging, dataset=lives, episode_steps=3)
-        with pytest.raises(ValueError, match="cycles = 4 needs a dataset"):
-            CalibrationEnv(BatteryVoltageJoint, cycles=4)
+        with pytest.raises(TypeError, match=r"decisions_per_cycle must be a whole number, got 2\.0"):
+            CalibrationEnv(BatteryAging, dataset=lives, cycles=4, decisions_per_cycle=2.0)
 
-    def test_any_voltage_task_goes_through_lives(self, lives):
-        options = {"start": "new_cell", "new_readings": (10, 60), "dataset": lives, "cycles": 4}
-        joint, qmax = (CalibrationEnv(each, episode_steps=2, **options) for each in (BatteryVoltageJoint, BatteryVoltageQmax))
-        aging = CalibrationEnv(BatteryAging, dataset=lives, cycles=4, decisions_per_cycle=2)
-        np.testing.assert_array_equal(joint.reset(seed=0)[0], aging.reset(seed=0)[0])
-        qmax.reset(seed=0)
-        for decision in range(8):
-            ended = [env.step(np.full(env.action_space.shape, -0.3, np.float32))[3] for env in (joint, aging, qmax)]
-            assert ended == [decision == 7] * 3
+    def test_where_no_reading_has_to_arrive_a_cycle_starts_with_some_all_the_same(self, lives):
+        task = BatteryAging(50, dataset=lives, cycles=4, decisions_per_cycle=1, new_readings=(0, 1))
+        task.start(np.arange(50), [np.random.default_rng(n) for n in range(50)])
+        for _ in range(3):
+            cost = task.advance(np.zeros((50, 2)))
+            assert np.isfinite(task.observation()).all() and (cost > 0.0).all() and (task.count >= 3).all()
+
+    @pytest.mark.parametrize(("kind", "data"), [(BatteryVoltageJoint, False), (BatteryVoltageQmax, True)])
+    def test_a_life_needs_its_discharges_and_both_parameters(self, lives, kind, data):
+        with pytest.raises(ValueError, match=r"cycles = 4 needs a dataset .* both parameters"):
+            kind(1, 4, dataset=lives if data else None)

@@ -75,7 +75,8 @@ class BatteryAging(VoltageTask):
 
     ## Episode end
 
-    Truncated after the last decision of the last cycle: 8 decisions in each of 20 cycles. Never terminated.
+    Truncated after the last decision of the last cycle: 8 decisions in each of 20 cycles, of which the last knows some two
+    thirds of the readings. Never terminated.
 
     ## Arguments
 
@@ -104,7 +105,7 @@ class BatteryAging(VoltageTask):
         dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **others: Any,
     ) -> None:
-        check_counts(cycles=cycles)
+        check_counts(cycles=cycles, decisions_per_cycle=decisions_per_cycle)
         if split not in LIVES:
             raise ValueError(f"split must be one of {tuple(LIVES)}, got {split!r}")
         if dataset is None:
@@ -113,8 +114,8 @@ class BatteryAging(VoltageTask):
             self._refuse_beside_a_dataset(split=split)
         super().__init__(
             cells,
+            cycles,
             episode_steps=decisions_per_cycle,
-            cycles=cycles,
             new_readings=new_readings,
             start=start,
             cell=cell,

@@ -91,8 +91,7 @@ class BatteryVoltageJoint(VoltageTask):
 
     | argument | default | meaning |
     |----------|---------|---------|
-    | ``episode_steps`` | 8 | decisions per discharge |
-    | ``cycles`` | 1 | discharges of an episode, of one life in the ``dataset``, with one estimate as in ``BatteryAging-v0`` |
+    | ``episode_steps`` | 8 | decisions per episode |
     | ``reading_s`` | 10 | least time between two readings, s, which are taken at samples; (least, most): simulated discharges have irregular ones, of a mean between both that is drawn for each |
     | ``new_readings`` | (0, 29) | fewest and most readings between two decisions |
     | ``noise_V`` | (0.001, 0.030) | least and greatest standard deviation of the voltage sensor's noise, V |

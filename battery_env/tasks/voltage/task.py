@@ -82,6 +82,7 @@ class VoltageTask(CalibrationTask):
     :ivar sensors: what they are read with
     :ivar path: along which the fit in the observation looks for the cell, if along one
     :param cells: size of the batch
+    :param cycles: discharges of an episode: those of one life in the data set, through which the estimate is carried
     :raises ValueError: for values out of range
     """
 
@@ -90,9 +91,9 @@ class VoltageTask(CalibrationTask):
     def __init__(
         self,
         cells: int,
+        cycles: int = 1,
         *,
         episode_steps: int = 8,
-        cycles: int = 1,
         reading_s: float | tuple[float, float] = 10.0,
         new_readings: tuple[int, int] = (0, 29),
         process_noise_V: float = 0.0,
@@ -125,8 +126,11 @@ class VoltageTask(CalibrationTask):
                     "take a task that looks for both"
                 )
         chosen = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
-        if cycles > 1 and dataset is None:
-            raise ValueError(f"cycles = {cycles} needs a dataset with the discharges of whole lives, life after life")
+        if cycles > 1 and (dataset is None or len(self.parameters) < len(PARAMETER_NAMES)):
+            raise ValueError(
+                f"cycles = {cycles} needs a dataset with the discharges of whole lives, life after life, and a task that "
+                "looks for both parameters, as both age"
+            )
         self._open(dataset, reading_s, cell, path, chosen)
         if len(self.readings) % cycles:
             raise ValueError(f"{len(self.readings)} discharges are no whole number of lives of {cycles} cycles")
@@ -283,7 +287,7 @@ class VoltageTask(CalibrationTask):
             return int(self._due(discharge)[0])
         length = int(self.readings.count[discharge])
         fewest, most = (_FEWEST_READINGS, length) if self.cycles == 1 else self.new_readings
-        return min(int(generator.integers(fewest, most, endpoint=True)), length)
+        return min(max(int(generator.integers(fewest, most, endpoint=True)), _FEWEST_READINGS), length)
 
     def _due(self, discharge: int) -> IntArray:
         """How many readings each decision on a whole record knows: two at least."""
@@ -314,7 +318,7 @@ class VoltageTask(CalibrationTask):
     @classmethod
     def discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
         """How many discharges an episode goes through."""
-        return int(options.get("cycles", cls.options()["cycles"]))
+        return int(options.get("cycles", cls.options().get("cycles", 1)))
 
     def seen(self) -> tuple[IntArray, FloatArray]:
         """Which readings the next decision knows."""
