@@ -65,11 +65,11 @@ class _Fitted:
     hidden_sd: Mapping[str, float]  # of what does not show in the voltage, charges that nobody saw among it, by parameter
     seen: Any  # what the samples show beside the fit
 
-    def sd(self, fit: Fit) -> dict[str, float]:
-        """The standard deviations of a fit, with those of what does not show."""
+    def sd(self, fit: Fit, ratios: Mapping[str, float]) -> dict[str, float]:
+        """The standard deviations of a fit, so many times as large as it says, with those of what does not show."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.search.parameters, _root_inverse_diagonal(fit.jacobian), strict=False):
-            sd[name] = hypot(sqrt(self.variance_V2) * float(root), self.hidden_sd[name])
+            sd[name] = hypot(ratios.get(name, 1.0) * sqrt(self.variance_V2) * float(root), self.hidden_sd[name])
         return sd
 
 
@@ -253,8 +253,8 @@ class LeastSquares(Estimator):
             search = search.until_empty()
             starts = search.starts([self.model.cell.q_mobile])[0]
         found = self._fitted(record, search, starts, shown)
-        sd, values, verdict = found.sd(found.fit), found.fit.values, self._verdict(record, shown, found)
-        sd = {name: self._sd_ratio * each for name, each in sd.items()}
+        sd = found.sd(found.fit, dict.fromkeys(self.parameters, self._sd_ratio))
+        values, verdict = found.fit.values, self._verdict(record, shown, found)
         constants = None if self.path is None else {name: values[name] for name in self.nuisance}
         return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict(), constants=constants)
 
@@ -328,8 +328,7 @@ class LeastSquares(Estimator):
         """What speaks against an estimate."""
         fit, alone, cell, diagnosis = found.fit, found.alone, self.model.cell, Diagnosis()
         n, free, q_mobile = len(fit.residual_V), self.parameters, fit.values["q_mobile"]
-        own, moved_V2 = found.sd(alone), fit.square_V2 - alone.square_V2
-        own["q_mobile"] *= self._sd_ratio
+        own, moved_V2 = found.sd(alone, {"q_mobile": self._sd_ratio}), fit.square_V2 - alone.square_V2
         unknown = [name for name in free if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
         unsettled_sd_C = own["q_mobile"] if "q_mobile" in unknown else inf
         note_samples(diagnosis, found.seen, self.initial_soc[0], record, shown, unsettled_sd_C)

@@ -10,7 +10,6 @@ from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, AgingPath, cell_with
 from battery_env.estimates import Estimate
-from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import (
     EXCESS_LIMIT_UNSTATED,
     MISMATCH_MARGIN,
@@ -21,8 +20,10 @@ from battery_env.estimators.diagnosis.conditions import (
     Verdict,
     rest_voltage_V,
     start_measured,
+    white_noise_V,
 )
 from battery_env.estimators.diagnosis.samples import note_samples, unseen_C, watched
+from battery_env.estimators.search import square
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import Samples, Shown
 from battery_env.records.model import RecordModel
@@ -55,39 +56,47 @@ class Confidence:
         self._sd_ratio = 1.0 if task.path is None else task.path.sd_ratio
         self._cell, self._dt_s = cell, dt_s
 
-    def standard_deviations(self, fitted: Fitted, estimate: FloatArray) -> FloatArray:
-        """Those of the fit, with the distance of the estimate from it."""
-        known = [name not in self._parameters for name in PARAMETER_NAMES]
-        return np.where(known, np.nan, np.hypot(self._sd_ratio * fitted.sd, fitted.estimate - estimate))
-
     def constants(self, fitted: Fitted, n: int) -> dict[str, float] | None:
         """What the fit says of the constants along a path, by their names."""
         if self._path is None:
             return None
         return dict(zip((*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES), fitted.constants[n].tolist(), strict=True))
 
-    def verdict(self, fitted: Fitted, n: int, estimate: FloatArray, record: Samples, shown: Shown) -> Verdict:
+    def _model_V(self, fitted: Fitted, n: int, record: Samples) -> FloatArray:
+        """The voltage of the model that was fitted, at the samples of a record."""
+        constants = np.zeros(len(UNCERTAIN_CONSTANTS) + len(EQUILIBRIUM_NAMES))
+        constants[: fitted.constants.shape[1]] = fitted.constants[n]
+        cell = cell_with(self._cell, dict(zip((*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES), constants.tolist(), strict=True)))
+        # a linear step may go beyond
+        q_mobile, r_o = np.clip(fitted.estimate[n], *np.array([ESTIMATE_RANGES[name] for name in PARAMETER_NAMES]).T).tolist()
+        return RecordModel(cell, dt_s=self._dt_s).voltage(record, Estimate(q_mobile, r_o)) + fitted.offset_V[n]
+
+    def verdict(
+        self, fitted: Fitted, n: int, estimate: FloatArray, record: Samples, shown: Shown
+    ) -> tuple[Verdict, FloatArray]:
         """
-        Which numbers of an estimate are settled, and why not both. What is known of the parameters before settles nothing.
+        Which numbers of an estimate are settled, and why not both; and its standard deviations, those of the fit with the
+        distance of the estimate from it and the charge that nobody saw, shape (2,). What is known of the parameters before
+        settles nothing.
         """
         diagnosis, cell, (q_mobile, r_o) = Diagnosis(), self._cell, estimate.tolist()
-        sd = np.hypot(fitted.sd_alone[n] * [self._sd_ratio, 1.0], fitted.estimate[n] - estimate)
-        readings, white_V, offset_V = int(fitted.readings[n]), float(fitted.white_V[n]), abs(float(fitted.offset_V[n]))
+        model_V = self._model_V(fitted, n, record)
+        seen = watched(record, cell, 1.0, (q_mobile, r_o), shown, model_V)
+        hidden = np.hypot([unseen_C(seen), 0.0], fitted.estimate[n] - estimate)
+        sd = np.hypot(fitted.sd_alone[n] * [self._sd_ratio, 1.0], hidden)
+        is_measured = np.isfinite(record.voltage_V)
+        residual_V = (model_V - record.voltage_V)[is_measured]  # NaN after the model is empty
+        white_V = white_noise_V(residual_V[np.isfinite(residual_V)])
+        readings, offset_V = len(residual_V), abs(float(fitted.offset_V[n]))
         first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(cell)
         mismatch_V = 0.0 if self._path is None else MISMATCH_MARGIN * self._path.mismatch_V
         is_above = first_V > full_V + self._offset_V + _NOISES * sqrt(white_V**2 + mismatch_V**2)
         diagnosis.note(Condition.START_ABOVE, is_above, **start_measured(first_V, full_V))
-        model_V = None
-        if gaps.may_have_any(record.time_s):
-            model = RecordModel(cell_with(cell, self.constants(fitted, n)), dt_s=self._dt_s)
-            model_V = model.voltage(record, Estimate(q_mobile, r_o))
-        seen = watched(record, cell, 1.0, (q_mobile, r_o), shown, model_V)
-        sd = np.hypot(sd, [unseen_C(seen), 0.0])
         note_samples(diagnosis, seen, 1.0, record, shown, inf if sd[0] < SETTLED_SHARES["q_mobile"] * q_mobile else sd[0])
         diagnosis.note(Condition.FEW, readings < len(self._parameters) + SPARE_SAMPLES, of="readings", or_else="")
         limit_V2 = (1.0 + EXCESS_LIMIT_UNSTATED / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
         limit_V2 += mismatch_V**2
-        diagnosis.note(Condition.UNEXPLAINED, not fitted.noise_V[n] ** 2 <= limit_V2)
+        diagnosis.note(Condition.UNEXPLAINED, not square(residual_V) <= readings * limit_V2)
         is_off = offset_V > _OFFSET_MARGIN * self._offset_V
         diagnosis.note(Condition.OFFSET, is_off, offset_mV=1e3 * offset_V, most_mV=1e3 * self._offset_V)
         if self._path is None:
@@ -103,4 +112,6 @@ class Confidence:
             diagnosis.note(Condition.Q_DIFFERS.of(name), not differs[k] < share, differs=differs[k])
             diagnosis.note(Condition.Q_IMPRECISE.of(name), not sd[k] < share * estimate[k])
         values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
-        return diagnosis.verdict(values, sds)
+        known = [name not in self._parameters for name in PARAMETER_NAMES]
+        stated = np.where(known, np.nan, np.hypot(self._sd_ratio * fitted.sd[n], hidden))
+        return diagnosis.verdict(values, sds), stated

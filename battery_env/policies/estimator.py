@@ -157,8 +157,7 @@ class PolicyEstimator(OnlineEstimator):
         self._verdict = Verdict(False, False, Condition.NO_FIT.text) if self._confidence is None else _NOT_JUDGED
         if self._confidence is not None and self._fitted is not None:
             samples = with_voltage(self._samples, self._decisions * self.decision_s)
-            (sd,) = self._confidence.standard_deviations(self._fitted, self._now[None])
-            self._verdict = self._confidence.verdict(self._fitted, 0, self._now, samples, Shown())
+            self._verdict, sd = self._confidence.verdict(self._fitted, 0, self._now, samples, Shown())
             self._found = self._confidence.constants(self._fitted, 0)
             # the same NaN always, so that equal estimates are equal
             self._sd = [nan if isnan(each) else each for each in sd.tolist()]
@@ -284,13 +283,13 @@ class PolicyEstimator(OnlineEstimator):
         verdicts: list[Verdict] = []
         found: list[dict[str, float] | None] = []
         while (running := ~task.truncated()).any():
-            (discharge, time_s), fitted = task.seen(), task.fitted()
+            (discharge, time_s, known), fitted = task.seen(), task.fitted()
             action, _ = self.policy.predict(task.observation(), deterministic=True)
             task.advance(np.asarray(action))
             estimate = task.estimate
             columns = [discharge[:, None], time_s[:, None], estimate]
             if self._confidence is not None and fitted is not None:
-                sd = self._confidence.standard_deviations(fitted, estimate)
+                sd = np.full_like(estimate, nan)
                 columns.append(sd)
                 is_open = judge_last_only & ~task.truncated()
                 for n in np.flatnonzero(running).tolist():
@@ -299,8 +298,8 @@ class PolicyEstimator(OnlineEstimator):
                         found.append(None)
                         continue
                     record, shown = samples[discharge[n]]
-                    so_far = record.first(int(np.searchsorted(record.time_s, time_s[n], side="right")))
-                    verdicts.append(self._confidence.verdict(fitted, n, estimate[n], so_far, shown))
+                    verdict, sd[n] = self._confidence.verdict(fitted, n, estimate[n], record.first(int(known[n])), shown)
+                    verdicts.append(verdict)
                     found.append(self._confidence.constants(fitted, n))
             made.append(np.concatenate(columns, axis=1)[running])
             task.drop_ended()

@@ -90,7 +90,9 @@ def rest_current_A(current_A: FloatArray) -> float | None:
     """
     loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
     before, after = current_A[: loaded[0]], current_A[loaded[-1] + 1 :]
-    rests = [part[np.abs(part) <= SWITCH_SHARE * np.ptp(current_A)] for part in (before, after)]
+    # what is no load, before it or after, is a rest, unless a charge
+    largest_A = current_A.max() - min(current_A.min(), 0.0)
+    rests = [part[np.abs(part) <= SWITCH_SHARE * largest_A] for part in (before, after)]
     before_A, after_A = (float(np.median(rest)) if len(rest) else 0.0 for rest in rests)
     if not len(rests[1]):
         return before_A if len(rests[0]) else None

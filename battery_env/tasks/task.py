@@ -137,10 +137,10 @@ class CalibrationTask(ABC):
         """
 
     @abstractmethod
-    def seen(self) -> tuple[IntArray, FloatArray]:
+    def seen(self) -> tuple[IntArray, FloatArray, IntArray]:
         """
-        Which data the next decision knows: each cell's discharge, and the time of its last sample, s, new arrays of shape
-        (cells,).
+        Which data the next decision knows: each cell's discharge, the time of its last sample, s, and how many samples these
+        are, new arrays of shape (cells,).
         """
 
     def fitted(self) -> Fitted | None:

@@ -266,6 +266,10 @@ class TestCalibrations:
         told = json.loads(capsys.readouterr().out)
         assert told["eod_time_s"][1] == pytest.approx(found.predicted_eod_time_s, rel=0.01)
 
+    def test_a_gain_that_may_be_off_is_the_sensors_and_not_one_of_unlike_cells(self, b0006):
+        for n in (0, 40, 100):
+            assert calibrate(load_nasa_discharges("B0005")[n], cell=b0006).settled
+
     def test_the_life_of_the_cell_itself_goes_with_it(self, b0006):
         discharges, settings = load_nasa_discharges("B0005")[76:81], Settings.for_cell(b0006, cut_off_V=2.7)
         before = track_life(discharges[:-1], 2.7, settings.calibrator())

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from math import expm1, hypot, isnan
 
-import numpy as np
-
-from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
 from battery_env.estimators.diagnosis.conditions import Condition
 from battery_env.estimators.diagnosis.rows import NOISES, SMOOTHED_SHARE, STEADY_S, Row, find, middle, noise_V, table
@@ -41,12 +38,6 @@ USUAL = table(
 #: the model after it, the first voltages then, and how many; 0: none is pending. And the charge of those that are in doubt,
 #: and how long the longest of them is.
 GAP = table("length_s end_s charge_C fall_V model_V after_V next_V samples doubt_C doubt_s")
-
-
-def may_have_any(time_s: FloatArray) -> bool:
-    """Whether intervals between samples are so unlike that some may be gaps."""
-    step_s = np.diff(time_s)
-    return bool((step_s[1:] > _RATIO * step_s[:-1]).any())
 
 
 @compiled

@@ -242,9 +242,10 @@ class FullStateTask(CalibrationTask):
             task.start(np.array([row]), [np.random.default_rng(n)], point)
         return task
 
-    def seen(self) -> tuple[IntArray, FloatArray]:
+    def seen(self) -> tuple[IntArray, FloatArray, IntArray]:
         """Which data the next decision knows, x_{t+1} among them; times on the clock of the data set."""
-        return self.now["trajectory"].copy(), np.asarray((self.now["sample"] + 1) * self.dataset.dt_s, dtype=np.float64)
+        last = self.now["sample"] + 1
+        return self.now["trajectory"].copy(), np.asarray(last * self.dataset.dt_s, dtype=np.float64), last + 1
 
     @property
     def estimate(self) -> FloatArray:

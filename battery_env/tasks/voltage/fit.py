@@ -85,11 +85,8 @@ class Fitted(NamedTuple):
     sd: FloatArray  # their standard deviations under the priors, 0 where one is known, same shape
     sd_alone: FloatArray  # what they would be if nothing were known of the parameters before, same shape
     constants: FloatArray  # as of NuisanceFit, shape (cells, 4) or (cells, 12)
-    noise_V: FloatArray  # root mean square of the residuals that it leaves, V, shape (cells,)
     offset_V: FloatArray  # of the voltage sensor, V, shape (cells,)
     constants_sd: FloatArray  # of the farthest constant, or of the cell beside its path, standard deviations, shape (cells,)
-    readings: IntArray  # to how many it is a fit, shape (cells,)
-    white_V: FloatArray  # noise that no model can explain, V, shape (cells,); infinite where readings are too few
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +189,7 @@ class NuisanceFit:
         """Forget the constants of a cell."""
         self.constants[row] = self._first
 
-    def found(self, estimate: FloatArray, readings: IntArray, white_V: FloatArray) -> Fitted:
+    def found(self, estimate: FloatArray) -> Fitted:
         """What the last step found."""
         found, n = self._found.copy(), len(self.prior.mean)
         step, sd, sd_alone = (found[:, first : first + 2] for first in (0, n, 2 * n + 1))
@@ -202,7 +199,7 @@ class NuisanceFit:
         else:
             kept = np.maximum(after, 0.5 * estimate)  # a step so long has no logarithm
             constants_sd = self.prior.path.distances_sd(np.hstack([constants, np.log(kept)]))
-        return Fitted(after, sd, sd_alone, constants, found[:, 2 * n], found[:, _OFFSET], constants_sd, readings, white_V)
+        return Fitted(after, sd, sd_alone, constants, found[:, _OFFSET], constants_sd)
 
     def beside(self, estimate: FloatArray, distance_sd: FloatArray) -> FloatArray:
         """Parameters that lie so many standard deviations beside those of the fit, C and ohm, shape (cells, 2)."""

@@ -80,7 +80,8 @@ class Readings:
     start: IntArray  # where each discharge starts, shape (n,)
     start_s: FloatArray  # time of its first sample, s, shape (n,)
     count: IntArray  # how many readings it has, shape (n,)
-    time_s: FloatArray  # of the readings since the first sample, s, shape (total,), as all that follow
+    sample: IntArray  # which sample of its discharge each reading is, shape (total,), as all that follow
+    time_s: FloatArray  # of the readings since the first sample, s
     voltage_V: FloatArray  # terminal voltage
     current_A: FloatArray  # mean since the reading before
     drawn_C: FloatArray  # charge drawn since the start
@@ -128,15 +129,16 @@ class Readings:
             current_A = resample_current(time_s, samples.current_A, dt_s, int(steps[-1]))
             drawn_C, moved_C, ohmic_A = _linear_part(current_A, steps, dt_s, cell)
             mean_A = np.diff(drawn_C, prepend=0.0) / (dt_s * np.diff(steps, prepend=0))
-            columns.append((dt_s * steps, samples.voltage_V[chosen], mean_A, drawn_C, moved_C, ohmic_A))
+            columns.append((chosen, dt_s * steps, samples.voltage_V[chosen], mean_A, drawn_C, moved_C, ohmic_A))
         if not columns:
             raise ValueError("there must be at least one discharge to read")
         counts = np.array([len(column[0]) for column in columns], dtype=np.int64)
-        at_s, voltage_V, current_A, drawn_C, moved_C, ohmic_A = map(np.concatenate, zip(*columns, strict=True))
+        sample, at_s, voltage_V, current_A, drawn_C, moved_C, ohmic_A = map(np.concatenate, zip(*columns, strict=True))
         return cls(
             start=np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
             start_s=np.array([float(record.time_s[0]) for record in records]),
             count=counts,
+            sample=sample,
             time_s=at_s,
             voltage_V=voltage_V,
             current_A=current_A,

@@ -15,7 +15,6 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import CellParameters, check_cell
 from battery_env.electrochemistry.aging_path import AgingPath
-from battery_env.estimators.diagnosis.conditions import white_noise_V
 from battery_env.parameters import PARAMETER_NAMES, columns_of
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
@@ -320,10 +319,11 @@ class VoltageTask(CalibrationTask):
         """How many discharges an episode goes through."""
         return int(options.get("cycles", cls.options().get("cycles", 1)))
 
-    def seen(self) -> tuple[IntArray, FloatArray]:
+    def seen(self) -> tuple[IntArray, FloatArray, IntArray]:
         """Which readings the next decision knows."""
         readings = self.readings
-        return self.discharge.copy(), readings.start_s[self.discharge] + self._time_s
+        last = readings.sample[readings.start[self.discharge] + self.count - 1]
+        return self.discharge.copy(), readings.start_s[self.discharge] + self._time_s, last + 1
 
     @property
     def _time_s(self) -> FloatArray:
@@ -337,13 +337,7 @@ class VoltageTask(CalibrationTask):
 
     def fitted(self) -> Fitted | None:
         """What the fit in the observation says (options ``nuisance`` and ``path``)."""
-        if self._fit is None:
-            return None
-        # without the ohmic drops, which jump where the load is switched
-        at_rest_V = self._shown[MEASURED] + self._estimate[:, 1:] * self._shown[OHMIC]
-        parts = zip(at_rest_V, self.count, strict=True)
-        white_V = [white_noise_V(each[:end], order=2) if end > 2 else np.inf for each, end in parts]
-        return self._fit.found(self._estimate, self.count.copy(), np.array(white_V))
+        return None if self._fit is None else self._fit.found(self._estimate)
 
     def _place(self, row: int, discharge: int, count: int, estimate: FloatArray) -> None:
         """Put one cell at one point of one discharge, measured without error."""
