@@ -16,8 +16,8 @@ def test_few_discharges_of_one_cell_make_its_tables_and_the_policy(tmp_path, mon
     asked = ["--every", "20", "--algos", "lac", "--seeds", "0", "1", "--jobs", "1", "--out", str(tmp_path)]
     aging_paths.main([*asked, "--export"])
     rows, shares = pd.read_csv(tmp_path / "discharges.csv"), 2
-    # of two discharges, by two methods whole and in progress, by six that tell an end, and by policies alone and as one
-    assert len(rows) == 2 * (2 * shares + 6 * (shares - 1) + 3 * shares) and set(rows["cell"]) == {"B0005"}
+    # of two discharges, by three methods whole and in progress, by six that tell an end, and by policies alone and as one
+    assert len(rows) == 2 * (3 * shares + 6 * (shares - 1) + 3 * shares) and set(rows["cell"]) == {"B0005"}
     whole = rows["share"] == 1.0
     assert (rows["error_percent"].abs().dropna() < 20.0).all() and (rows["q_error_percent"][whole].abs() < 2.0).all()
     text = (tmp_path / "aging_paths.md").read_text()

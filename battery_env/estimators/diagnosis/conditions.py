@@ -151,10 +151,6 @@ class Condition(IntEnum):
         "The voltage of the model is farther off than noise and mismatch_V explain: fit constants to this cell (fit_cell, "
         "--cell), state a larger mismatch_V, or check the sensors, the prior if one was given, and that this is one discharge."
     )
-    UNEXPLAINED = (
-        "The voltage is farther off than noise, an offset and the constants that the policy knows of explain: use least "
-        "squares with mismatch_V, or check the sensors and that this is one discharge."
-    )
     OTHER_END = "The record falls to {lowest_V:.2f} V at {end_s:.0f} s, where this estimate says {model_end_s:.0f} s."
     OFFSET = (
         "The fit in the observation takes the voltage for {offset_mV:.0f} mV off, where the policy has learned of "
@@ -171,6 +167,11 @@ class Condition(IntEnum):
     NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
     Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
     R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
+    # after what makes it so
+    UNEXPLAINED = (
+        "The voltage is farther off than noise, an offset and the constants that the policy knows of explain: use least "
+        "squares with mismatch_V, or check the sensors and that this is one discharge."
+    )
     TAPERED_EARLY = (
         "The charge before the load ended while {charge_A:.3g} A still flowed: the cell had some {left_C:.0f} C left to take. "
         "Charge until less flows, or state initial_soc (--initial-soc).",
