@@ -163,15 +163,15 @@ class Condition(IntEnum):
     )
     Q_PRIOR_WRONG = _PRIOR_WRONG.format("q_max")
     R_PRIOR_WRONG = _PRIOR_WRONG.format("R_o")
-    # what the record does not tell of one number
-    NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
-    Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
-    R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
     # after what makes it so
     UNEXPLAINED = (
         "The voltage is farther off than noise, an offset and the constants that the policy knows of explain: use least "
         "squares with mismatch_V, or check the sensors and that this is one discharge."
     )
+    # what the record does not tell of one number
+    NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
+    Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
+    R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
     TAPERED_EARLY = (
         "The charge before the load ended while {charge_A:.3g} A still flowed: the cell had some {left_C:.0f} C left to take. "
         "Charge until less flows, or state initial_soc (--initial-soc).",
