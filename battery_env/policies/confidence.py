@@ -58,15 +58,11 @@ class Confidence:
 
     def constants(self, fitted: Fitted, n: int) -> dict[str, float] | None:
         """What the fit says of the constants along a path, by their names."""
-        if self._path is None:
-            return None
-        return dict(zip((*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES), fitted.constants[n].tolist(), strict=True))
+        return None if self._path is None else _by_name(fitted, n)
 
     def _model_V(self, fitted: Fitted, n: int, record: Samples) -> FloatArray:
         """The voltage of the model that was fitted, at the samples of a record."""
-        constants = np.zeros(len(UNCERTAIN_CONSTANTS) + len(EQUILIBRIUM_NAMES))
-        constants[: fitted.constants.shape[1]] = fitted.constants[n]
-        cell = cell_with(self._cell, dict(zip((*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES), constants.tolist(), strict=True)))
+        cell = cell_with(self._cell, _by_name(fitted, n))
         # a linear step may go beyond
         q_mobile, r_o = np.clip(fitted.estimate[n], *np.array([ESTIMATE_RANGES[name] for name in PARAMETER_NAMES]).T).tolist()
         return RecordModel(cell, dt_s=self._dt_s).voltage(record, Estimate(q_mobile, r_o)) + fitted.offset_V[n]
@@ -115,3 +111,9 @@ class Confidence:
         known = [name not in self._parameters for name in PARAMETER_NAMES]
         stated = np.where(known, np.nan, np.hypot(self._sd_ratio * fitted.sd[n], hidden))
         return diagnosis.verdict(values, sds), stated
+
+
+def _by_name(fitted: Fitted, n: int) -> dict[str, float]:
+    """The constants of a fit, by their names; without a path it has none of the equilibrium voltage."""
+    names = (*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES)
+    return dict.fromkeys(names, 0.0) | dict(zip(names, fitted.constants[n].tolist(), strict=False))
