@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -67,56 +67,6 @@ class Estimate:
 
 
 _COLUMNS = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled_q_mobile", "settled_r_o")
-
-
-class Estimates(Sequence[Estimate]):
-    """
-    What was estimated of many cells at once: a sequence of estimates, and arrays of shape (cells,).
-
-    :ivar q_mobile: C
-    :ivar r_o: ohm
-    :ivar sd_q_mobile: standard deviations, C
-    :ivar sd_r_o: likewise, ohm
-    :ivar settled: whether both numbers of each are settled
-    :ivar settled_q_mobile: whether each ``q_mobile`` is
-    :ivar settled_r_o: likewise
-    :param reason: of a cell by its number, why its estimate is not settled
-    """
-
-    def __init__(
-        self,
-        q_mobile: FloatArray,
-        r_o: FloatArray,
-        sd_q_mobile: FloatArray,
-        sd_r_o: FloatArray,
-        settled_q_mobile: BoolArray,
-        settled_r_o: BoolArray,
-        reason: Callable[[int], str],
-    ) -> None:
-        self.q_mobile, self.r_o, self.sd_q_mobile, self.sd_r_o = q_mobile, r_o, sd_q_mobile, sd_r_o
-        self.settled_q_mobile, self.settled_r_o = settled_q_mobile, settled_r_o
-        self.settled: BoolArray = settled_q_mobile & settled_r_o
-        self._reason = reason
-
-    def __len__(self) -> int:
-        return len(self.q_mobile)
-
-    @overload
-    def __getitem__(self, index: int) -> Estimate: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Estimate]: ...
-
-    def __getitem__(self, index: int | slice) -> Estimate | list[Estimate]:
-        if isinstance(index, slice):
-            return [self[n] for n in range(*index.indices(len(self)))]
-        n = range(len(self))[index]
-        return Estimate(**{name: getattr(self, name)[n].item() for name in _COLUMNS}, reason=self._reason(n))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Sequence) and list(self) == list(other)
-
-    __hash__ = None  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)

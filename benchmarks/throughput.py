@@ -14,10 +14,9 @@ round, and their median and quartiles are reported. All run on one core: its tim
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import cycle, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,7 +30,6 @@ from tqdm import trange
 from battery_env import ExtendedKalmanFilter, OnnxPolicy, PolicyEstimator
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, step_into, voltage_into
 from battery_env.estimators.estimator import OnlineEstimator
-from battery_env.estimators.kalman import KalmanBatch
 from battery_env.records import Stream
 from benchmarks.study import Study, command_line, markdown, positive
 from sb3_lac import LAC
@@ -43,9 +41,8 @@ _SIMULATED_STEPS = 1500
 _SIMULATIONS = 20
 _BATCHED_STEPS = 100
 _ENV_STEPS = 512
-# samples, 1 s apart, of a turn of those that take microseconds and milliseconds each, and of a batch of so many cells
-_SAMPLES, _PROGPY_SAMPLES, _PARTICLES_SAMPLES, _BATCH_SAMPLES = 600, 20, 4, 3
-_FILTERED_CELLS = 10_000
+# samples, 1 s apart, of a turn of those that take microseconds and milliseconds each
+_SAMPLES, _PROGPY_SAMPLES, _PARTICLES_SAMPLES = 600, 20, 4
 # and how often all cells of each decide in one turn: whole episodes
 _ENVIRONMENTS = {"BatteryQmax-v0": 128, "BatteryVoltageJoint-v0": 8}
 
@@ -151,7 +148,7 @@ def environment_contestants(cells: int) -> dict[str, Callable[[], int]]:
     return contestants
 
 
-def filter_contestants(cells: int, folder: Path) -> dict[str, Callable[[], int]]:
+def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
     """
     Calibrators that follow a stream of one sample a second, here and in progpy: both parameters unknown here, and ``q_mobile``
     alone in progpy. A policy decides once a minute, on all readings so far; the networks are untrained, which takes as long.
@@ -174,16 +171,10 @@ def filter_contestants(cells: int, folder: Path) -> dict[str, Callable[[], int]]
         ProgpyFilter("q_mobile", kind, 0.25 * NEW_CELL.q_mobile, 0.005).trace([record.part(0, count + 1)])
         return count
 
-    def batch(filters: KalmanBatch, at: Iterator[int]) -> int:
-        for n in islice(at, _BATCH_SAMPLES):
-            filters.update(record.voltage_V[n], 2.0, 1.0)
-        return _BATCH_SAMPLES * cells
-
-    carried = (6050.0, 60.0)
-    contestants: dict[str, Callable[[], int]] = {
+    return {
         "ExtendedKalmanFilter": partial(stream, ExtendedKalmanFilter(thermal=True)),
         "ExtendedKalmanFilter, prior of an earlier discharge": partial(
-            stream, ExtendedKalmanFilter(thermal=True, prior_q_mobile_C=carried)
+            stream, ExtendedKalmanFilter(thermal=True, prior_q_mobile_C=(6050.0, 60.0))
         ),
         "PolicyEstimator": partial(stream, PolicyEstimator(model, _POLICY_ENV)),
         "PolicyEstimator, ONNX": partial(
@@ -193,11 +184,6 @@ def filter_contestants(cells: int, folder: Path) -> dict[str, Callable[[], int]]
         "progpy, unscented Kalman filter": partial(peer, "ukf", _PROGPY_SAMPLES),
         "progpy, 100 particles": partial(peer, "particles", _PARTICLES_SAMPLES),
     }
-    for name, prior in (("", None), (", prior of an earlier discharge", carried)):
-        filters, at = ExtendedKalmanFilter(thermal=True, prior_q_mobile_C=prior).batch(cells), cycle(range(1, _SAMPLES))
-        filters.update(record.voltage_V[0], 2.0, 1.0)
-        contestants[f"batch of {cells} cells{name}"] = partial(batch, filters, at)
-    return contestants
 
 
 def report_filters(speeds: pd.DataFrame) -> str:
@@ -247,14 +233,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--cells", type=positive, default=1024, help="cells of a batch of the model and of a vector environment"
     )
-    parser.add_argument("--filtered-cells", type=positive, default=_FILTERED_CELLS, help="cells of a batch of filters")
     study = Study(parser, arguments)
     chosen = study.chosen
     with TemporaryDirectory() as folder:
         sections = {
             "model": (partial(model_contestants, chosen.cells), report_steps),
             "environments": (partial(environment_contestants, chosen.cells), report_steps),
-            "filters": (partial(filter_contestants, chosen.filtered_cells, Path(folder)), report_filters),
+            "filters": (partial(filter_contestants, Path(folder)), report_filters),
         }
         for section in chosen.only:
             contestants, report = sections[section]

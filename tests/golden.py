@@ -109,7 +109,7 @@ def calibrators() -> Numbers:
 
 
 def streams() -> Numbers:
-    """What the filter and a policy say sample by sample: of whole and changed records, one cell and many."""
+    """What the filter and a policy say sample by sample: of whole and changed records."""
     record = load_nasa_discharges("B0005")[40]
     time_s, voltage_V, current_A = (column[::3] for column in (record.time_s, record.voltage_V, record.current_A))
     assert record.temperature_C is not None
@@ -152,11 +152,6 @@ def streams() -> Numbers:
         "function": lambda t: 1.0 + t / 1e4,
     }.items():
         yield f"remaining/{name}", np.array(filters["kalman"].remaining(given, 2.8, "power" if name == "cycle" else "current"))
-    for name in ("kalman", "prior"):
-        batch = filters[name].batch(len(changed))
-        for n in range(len(time_s)):
-            together = batch.update(*(np.array([columns[k][n] for columns in changed.values()]) for k in range(3)))
-        yield f"stream/{name}/batch", np.array([[e.q_mobile, e.r_o, e.sd_q_mobile, e.sd_r_o, e.settled] for e in together])
 
 
 def fits() -> Numbers:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from battery_env.files import DamagedError, npz_path, read_npz, replacing, set_aside
 
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 _KIND = "state of an estimator"
 
 

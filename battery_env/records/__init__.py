@@ -9,7 +9,6 @@ from battery_env.records.samples import ExpectedCurrent as ExpectedCurrent
 from battery_env.records.samples import Record as Record
 from battery_env.records.samples import Samples as Samples
 from battery_env.records.samples import Stream as Stream
-from battery_env.records.samples import are_plausible as are_plausible
 from battery_env.records.samples import check_drawn_charge as check_drawn_charge
 from battery_env.records.samples import check_record as check_record
 from battery_env.records.samples import check_sample as check_sample

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from battery_env.arrays import BoolArray, FloatArray, IntArray
+from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LOAD_LIMITS
 
 #: A change of the current between two samples by more than this share of its largest magnitude is a switch of the load,
@@ -184,25 +184,6 @@ def _is_within(name: str, value: float, low: float, high: float) -> bool:
         return low <= value <= high
     except TypeError as error:
         raise TypeError(f"{name} must be a number, got {value!r}. {_MISSING.get(name, '')}".strip()) from error
-
-
-def are_plausible(
-    voltage_V: FloatArray,
-    current_A: FloatArray,
-    dt_s: FloatArray,
-    temperature_C: FloatArray | None,
-    previous_A: FloatArray,
-) -> BoolArray:
-    """Which samples of many streams, none of them the first, :func:`check_sample` takes."""
-    low, high, _, _ = _PLAUSIBLE["voltage_V"]
-    good = np.isnan(voltage_V) | ((voltage_V >= low) & (voltage_V <= high))
-    for name, values in (("current_A", current_A), ("temperature_C", temperature_C)):
-        if values is not None:
-            low, high, _, _ = _PLAUSIBLE[name]
-            good &= (values >= low) & (values <= high)
-    low, high = SAMPLE_INTERVAL_LIMITS_S
-    longest_s = np.where(np.abs(previous_A) <= REST_CURRENT_A, REST_LIMIT_S, high)
-    return np.asarray(good & (dt_s >= low) & (dt_s <= longest_s))
 
 
 def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:

@@ -412,13 +412,6 @@ def window_trace(record: Case) -> Estimate:
     return last_estimate(LeastSquares(thermal=True, mismatch_V=0.02, window_every_s=600.0).trace([record])[0])
 
 
-def of_a_batch(record: Case) -> Estimate:
-    cells = ExtendedKalmanFilter(thermal=True).batch(2)
-    for sample in Stream.of(record, 1.0).samples():
-        estimates = cells.update(*sample)
-    return estimates[1]
-
-
 def held(name: str, record: Case) -> dict[str, object]:
     """Arguments of a calibrator that is told the other parameter."""
     other = {"q_mobile": "r_o", "r_o": "q_mobile"}[name]
@@ -440,7 +433,6 @@ EVERY_ESTIMATOR = {
     "least squares, r_o": lambda record: LeastSquares(**held("r_o", record)).estimate(record),
     "filter, q_mobile": lambda record: ExtendedKalmanFilter(**held("q_mobile", record)).estimate(record),
     "filter, r_o": lambda record: ExtendedKalmanFilter(**held("r_o", record)).estimate(record),
-    "filter, batch": of_a_batch,
 }
 
 

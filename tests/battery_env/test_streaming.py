@@ -1,14 +1,12 @@
-"""Streams: sample by sample, with gaps and rests, stopped and resumed, one cell and many, of filters and policies."""
+"""Streams: sample by sample, with gaps and rests, stopped and resumed, of filters and policies."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from battery_env import Discharge, ExtendedKalmanFilter, PolicyEstimator, simulate
-from battery_env.records import Stream, are_plausible, check_sample
+from battery_env.records import Stream
 from tests.policies import Always
 
 NOISE_V = 0.005
@@ -103,21 +101,15 @@ class TestSamples:
         ],
     )
     def test_what_cannot_be_meant_is_refused_and_changes_nothing(self, make, sample, error, message):
-        estimator, untouched, batch, good = make(), make(), ExtendedKalmanFilter(thermal=True).batch(2), (4.1, 2.0, 1.0)
+        estimator, untouched, good = make(), make(), (4.1, 2.0, 1.0)
         if "dt_s" not in message:  # which the first sample does not need
             with pytest.raises(error, match=f"^{message}"):
                 estimator.update(*sample)
-        for each in (estimator, untouched, batch):
+        for each in (estimator, untouched):
             each.update(4.19, 2.0, 0.0)
         with pytest.raises(error, match=f"^{message}"):
             estimator.update(*sample)
-        if error is ValueError:  # arrays make numbers of what is none, where they can
-            with pytest.raises(error, match=f"^cell 1: {message}"):
-                batch.update(*map(list, zip(good, sample, strict=True)))
-        expected = untouched.update(*good)
-        assert repr(estimator.update(*good)) == repr(expected)
-        if isinstance(estimator, ExtendedKalmanFilter):
-            assert repr(list(batch.update(*good))) == repr([expected] * 2)
+        assert repr(estimator.update(*good)) == repr(untouched.update(*good))
 
     def test_kelvin_is_refused_and_a_policy_takes_no_temperature(self):
         with pytest.raises(ValueError, match=r"temperature_C must lie within .* not in kelvin"):
@@ -207,71 +199,3 @@ class TestFiles:
         file = make().save(tmp_path / "state.npz")
         with pytest.raises(ValueError, match=r"is of an estimator with .*make one with the same arguments"):
             make_other().load(file)
-
-
-class TestBatch:
-
-    def test_cells_do_not_know_of_each_other(self, whole, tmp_path):
-        def make():
-            return ExtendedKalmanFilter(thermal=True)
-
-        records = [whole, measured(1.5, 5000.0, 0.2)]
-        batch, *alone = make().batch(2), make(), make()
-        for n in range(300):
-            found = batch.update([record.voltage_V[n] for record in records], [record.current_A[n] for record in records], 1.0)
-        # as text, in which what is not stated (NaN) is equal
-        expected = [follow(each, record.part(0, 300)) for each, record in zip(alone, records, strict=True)]
-        assert repr(list(found)) == repr(expected)
-        other = make().batch(2)
-        other.load(batch.save(tmp_path / "cells"))
-        assert repr(list(other.update(3.9, 1.0, 1.0))) == repr(list(batch.update(3.9, 1.0, 1.0)))
-        batch.reset([1])
-        assert batch.estimators[1].soc == 1.0 and batch.estimators[0].soc < 1.0
-        with pytest.raises(ValueError, match="cells must be at least 1"):
-            make().batch(0)
-
-    @pytest.mark.parametrize(
-        "arguments", [{}, {"mismatch_V": 0.02, "parameters": ["q_mobile"]}, {"initial_soc": (0.95, 0.01)}]
-    )
-    def test_filters_say_the_same_to_the_bit_side_by_side(self, arguments, whole):
-        rng = np.random.default_rng(0)
-        filter_ = ExtendedKalmanFilter(thermal=True, **arguments)
-        batch, alone = filter_.batch(3), [ExtendedKalmanFilter(thermal=True, **arguments) for _ in range(3)]
-        for n in range(260):
-            volts = whole.voltage_V[n] - [0.0, 0.002, 0.004] + rng.normal(0.0, 0.002, 3)
-            volts[rng.random(3) < 0.1 * (n > 0)] = np.nan
-            amperes, dt_s = rng.uniform(0.0, 3.0, 3), rng.uniform(0.5, 3.0, 3)
-            degrees_C = None if 40 < n < 60 else np.array([20.0, 25.0, 30.0])
-            if n == 100:
-                batch.reset([1])
-                alone[1].reset()
-                volts[1] = 4.19
-            if n == 150:  # whoever holds one of them may use it
-                batch.estimators[2].reset()
-                alone[2].reset()
-                volts[2] = 4.18
-            found = batch.update(volts, amperes, dt_s, degrees_C)
-            kelvin = [None] * 3 if degrees_C is None else degrees_C.tolist()
-            expected = [one.update(*sample) for one, *sample in zip(alone, volts, amperes, dt_s, kelvin, strict=True)]
-            assert [repr(each) for each in found] == [repr(each) for each in expected]
-        np.testing.assert_array_equal(found.q_mobile, [each.q_mobile for each in expected])
-        assert [each.soc for each in batch.estimators] == [each.soc for each in alone]
-        assert [repr(each) for each in found[:2]] == [repr(each) for each in expected[:2]]
-
-    @settings(max_examples=60, deadline=None, derandomize=True, database=None)
-    @given(
-        st.sampled_from([-0.1, 0.0, 3.9, 5.5, 5.6, np.nan, np.inf]),
-        st.sampled_from([-60.0, 0.0, 0.01, 2.0, 60.0, np.nan]),
-        st.sampled_from([0.0, 1e-4, 1.0, 600.0, 601.0, 604_800.0, 604_801.0, np.nan]),
-        st.sampled_from([None, -70.0, 25.0, 290.0, np.nan]),
-        st.sampled_from([0.0, 0.01, 2.0]),
-    )
-    def test_a_batch_refuses_what_a_filter_refuses(self, voltage_V, current_A, dt_s, temperature_C, before_A):
-        try:
-            check_sample(voltage_V, current_A, dt_s, temperature_C, before_A)
-            good = True
-        except ValueError:
-            good = False
-        known = None if temperature_C is None else np.array([temperature_C])
-        columns = (np.array([each]) for each in (voltage_V, current_A, dt_s))
-        assert are_plausible(*columns, known, np.array([before_A])).tolist() == [good]

@@ -1,21 +1,21 @@
-"""Calibration during a discharge: an extended Kalman filter on voltage and current, of one cell or of many."""
+"""Calibration during a discharge: an extended Kalman filter on voltage and current."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import inf, isnan, nan
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative, check_numbers, check_whole_number
+from battery_env.checks import ZERO_CELSIUS_K, check_gain_sd, check_not_negative
 from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE, CellParameters, PackedConstants, check_cell, check_dt
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
-from battery_env.estimates import Estimate, Estimates, EstimateTrace
+from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.diagnosis.rest import check_initial_soc
@@ -23,9 +23,8 @@ from battery_env.estimators.diagnosis.samples import begin, belongs, examine, ex
 from battery_env.estimators.estimator import ModelNow, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
-from battery_env.estimators.state_files import Saved
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
-from battery_env.records import ChargeBefore, Record, Stream, are_plausible, check_drawn_charge, check_sample, shown_beside
+from battery_env.records import ChargeBefore, Record, Stream, check_drawn_charge, check_sample, shown_beside
 
 #: How far cells of one nominal capacity may lie from it, new and worn: the standard deviation, as a share.
 PRIOR_SD_SHARE_Q = 0.25
@@ -35,8 +34,6 @@ _HOUR_S = 3600.0
 # So far may the parameters wander in an hour, as a share of their prior means: a little keeps a filter awake.
 _DRIFT_PER_HOUR = 0.001
 _NOISE_V = 0.005
-# What reasons are made of
-_SHOWN = "start rest fault switch switches gap start_V time_s uncounted_C left_C dropped_C dropped_ohm".split()
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -171,8 +168,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
             cell_sd_r_o=float(cell_sd_r_o_ohm),
         )
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
-        self._cells = np.zeros(1, CELL)
-        self._filters = np.zeros((1, len(self._start(self.cell))), FILTER)
+        self._cell = np.zeros((), CELL)
+        self._filters = np.zeros(len(self._start(self.cell)), FILTER)
         self.reset()
 
     def _prior(self, name: str, prior: tuple[float, float] | None, default_sd: float) -> tuple[float, float]:
@@ -192,26 +189,26 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     def reset(self) -> None:
         """Forget all samples: the next one is the first of a discharge, of a cell at rest with ``initial_soc``."""
-        self._cells[...] = np.zeros((), CELL)
-        bank = self._cells["bank"]
+        self._cell[...] = np.zeros((), CELL)
+        bank = self._cell["bank"]
         bank["least_r"], bank["most_r"], bank["offset_V2"] = -inf, inf, self._sds[2] ** 2
         self._begin(self.cell.Tb0)
 
     def _begin(self, ambient_K: float) -> None:
         """Let the model start at this temperature, and in surroundings of it."""
-        self._cells["ambient_K"] = ambient_K
+        self._cell["ambient_K"] = ambient_K
         cell = self._cell_now()
-        self._cells["constants"] = cell.packed.constants
-        expect(self._cells["seen"], cell, self.initial_soc[0])
-        self._filters[0] = self._start(cell)
+        self._cell["constants"] = cell.packed.constants
+        expect(self._cell["seen"], cell, self.initial_soc[0])
+        self._filters[...] = self._start(cell)
 
     def _cell_now(self) -> CellParameters:
-        ambient_K = float(self._cells["ambient_K"][0])
+        ambient_K = float(self._cell["ambient_K"])
         return self.cell if ambient_K == self.cell.Tb0 else self.cell.replace(Tb0=ambient_K)
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
-        seen = self._cells["seen"][0]
+        seen = self._cell["seen"]
         before_A = float(seen["current_A"]) if seen["samples"] else None
         check_sample(voltage_V, current_A, dt_s, temperature_C, before_A)
         check_drawn_charge(float(seen["drawn_C"]) + (0.0 if before_A is None else dt_s * before_A), self.least_drawn_C)
@@ -223,20 +220,20 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
         temperature_K = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
-        if not self._cells["seen"]["samples"][0]:
+        if not self._cell["seen"]["samples"]:
             dt_s = 0.0
             if not isnan(temperature_K):
                 self._begin(temperature_K)
-        sample = np.array([[(voltage_V, current_A, dt_s, temperature_K, current_A)]], dtype=SAMPLE)
-        said = self._follow(self._cells, self._filters, sample)[0, 0]
-        shown = self._measured(self._cells["seen"][0])
+        sample = np.array([(voltage_V, current_A, dt_s, temperature_K, current_A)], dtype=SAMPLE)
+        (said,) = self._follow(sample)
+        shown = self._measured(self._cell["seen"])
         verdict = _verdict(said["condition"].tolist(), said["r_o_comes_first"], shown)
         return Estimate(float(said["q_mobile"]), float(said["r_o"]), *said["sd"].tolist(), **verdict._asdict())
 
-    def _follow(self, cells: NDArray[np.void], filters: NDArray[np.void], samples: NDArray[np.void]) -> NDArray[np.void]:
-        """What filters of these rows estimate after samples, shape (samples, cells)."""
-        estimates = np.empty(samples.shape, ESTIMATE)
-        _follow_all(cells, filters, samples, self._settings, self.cell.packed, self._derivatives, estimates)
+    def _follow(self, samples: NDArray[np.void]) -> NDArray[np.void]:
+        """What is estimated after each of these samples."""
+        estimates = np.empty(len(samples), ESTIMATE)
+        _follow_all(self._cell, self._filters, samples, self._settings, self.cell.packed, self._derivatives, estimates)
         return estimates
 
     def _measured(self, seen: Any, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
@@ -251,19 +248,19 @@ class ExtendedKalmanFilter(OnlineEstimator):
         stream = Stream.of(record, self.dt_s)
         self.reset()
         time_s, voltage_V, current_A, dt_s, temperature_C = stream
-        samples = np.zeros((len(time_s), 1), SAMPLE)
-        samples["voltage_V"][:, 0], samples["current_A"][:, 0], samples["dt_s"][:, 0] = voltage_V, current_A, dt_s
-        samples["read_A"][:, 0] = record.current_A
-        samples["temperature_K"][:, 0] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
+        samples = np.zeros(len(time_s), SAMPLE)
+        samples["voltage_V"], samples["current_A"], samples["dt_s"] = voltage_V, current_A, dt_s
+        samples["read_A"] = record.current_A
+        samples["temperature_K"] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
         if temperature_C is not None:
-            self._begin(float(samples["temperature_K"][0, 0]))
+            self._begin(float(samples["temperature_K"][0]))
         beside = shown_beside(record)
         if self.initial_soc[0] < 1.0:
             beside = beside._replace(charge=None)
-        take_in(self._cells["seen"], beside)
+        take_in(self._cell["seen"], beside)
         check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
-        said = self._follow(self._cells, self._filters, samples)[:, 0]
-        shown = self._measured(self._cells["seen"][0], float(time_s[0]), beside.charge)
+        said = self._follow(samples)
+        shown = self._measured(self._cell["seen"], float(time_s[0]), beside.charge)
         noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
         texts = {each: _verdict(*each, shown).reason for each in set(noted)}
         sd_q, sd_r_o = said["sd"].T.copy()
@@ -277,23 +274,15 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """The charge drawn stays above this: a cell takes no more than it has room for, C."""
         return -(SURPLUS_SHARE + (1.0 - self.initial_soc[0])) * self.cell.q_mobile
 
-    def batch(self, cells: int) -> KalmanBatch:
-        """Filters like this one, each for a cell of its own, which take their samples in one compiled call."""
-        return KalmanBatch(self, cells)
-
     def __copy__(self) -> ExtendedKalmanFilter:
         """A filter that goes its own way."""
-        return self._of_rows(self._cells.copy(), self._filters.copy())
-
-    def _of_rows(self, cells: NDArray[np.void], filters: NDArray[np.void]) -> ExtendedKalmanFilter:
-        """A filter with the same arguments, whose memory are these rows."""
         other = object.__new__(type(self))
-        vars(other).update(vars(self), _cells=cells, _filters=filters)
+        vars(other).update(vars(self), _cell=self._cell.copy(), _filters=self._filters.copy())
         return other
 
     def now(self) -> ModelNow:
         """The model at the last sample, at the mean of all filters."""
-        filters = self._filters[0]
+        filters = self._filters
         weight = np.exp(filters["log_weight"] - filters["log_weight"].max())
         weight /= weight.sum()
         best, alive = int(weight.argmax()), weight > 0.0
@@ -321,76 +310,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         }
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        return {"cells": self._cells, "filters": self._filters}
-
-
-class KalmanBatch(Saved):
-    """
-    Cells side by side, each followed by a filter of its own with the same arguments: rows of the same tables, which take their
-    samples in one compiled call.
-
-    :ivar estimators: these filters
-    :param estimator: what to copy; it stays as it is
-    :param cells: how many
-    :raises ValueError: for no cells
-    """
-
-    def __init__(self, estimator: ExtendedKalmanFilter, cells: int) -> None:
-        if check_whole_number("cells", cells) < 1:
-            raise ValueError(f"cells must be at least 1, got {cells!r}")
-        self._cells = np.zeros(cells, CELL)
-        self._filters = np.zeros((cells, estimator._filters.shape[1]), FILTER)
-        self.estimators = [estimator._of_rows(self._cells[n : n + 1], self._filters[n : n + 1]) for n in range(cells)]
-        self.reset()
-
-    def reset(self, cells: Iterable[int] | None = None) -> None:
-        """Let discharges begin."""
-        for n in range(len(self.estimators)) if cells is None else cells:
-            self.estimators[n].reset()
-
-    def update(
-        self, voltage_V: ArrayLike, current_A: ArrayLike, dt_s: ArrayLike, temperature_C: ArrayLike | None = None
-    ) -> Estimates:
-        """Take in one sample of each cell: of all, or of none if one is refused."""
-        cells, seen, one = self._cells, self._cells["seen"], self.estimators[0]
-        is_first = seen["samples"] == 0
-        samples = np.zeros((1, len(cells)), SAMPLE)
-        (of,) = samples
-        of["voltage_V"], of["current_A"] = check_numbers("voltage_V", voltage_V), check_numbers("current_A", current_A)
-        of["read_A"] = of["current_A"]
-        of["dt_s"] = np.where(is_first, 0.0, check_numbers("dt_s", dt_s))
-        degrees_C = None if temperature_C is None else np.asarray(temperature_C, dtype=np.float64)
-        of["temperature_K"] = nan if degrees_C is None else degrees_C + ZERO_CELSIUS_K
-        drawn_C = seen["drawn_C"] + seen["current_A"] * of["dt_s"]
-        good = are_plausible(of["voltage_V"], of["current_A"], of["dt_s"], degrees_C, seen["current_A"])
-        doubtful = is_first | ~(good & (drawn_C > one.least_drawn_C))
-        if doubtful.any():
-            # as objects, so that what is no number turns no other one into a text
-            given = (np.asarray(each, dtype=object) for each in (voltage_V, current_A, dt_s, temperature_C))
-            of_cells = list(zip(*(np.broadcast_to(each, len(cells)).tolist() for each in given), strict=True))
-            for n in np.flatnonzero(doubtful).tolist():
-                try:
-                    self.estimators[n].check(*of_cells[n])
-                except (TypeError, ValueError) as error:
-                    raise type(error)(f"cell {n}: {error}") from error
-        for n in np.flatnonzero(is_first & ~np.isnan(of["temperature_K"])).tolist():
-            self.estimators[n]._begin(float(of["temperature_K"][n]))
-        (said,) = one._follow(cells, self._filters, samples)
-        sd_q_mobile, sd_r_o = said["sd"].T
-        shown = {name: seen[name].copy() for name in _SHOWN}
-
-        def reason_of(n: int) -> str:
-            of_cell = {name: column[n] for name, column in shown.items()}
-            return _verdict(said["condition"][n], said["r_o_comes_first"][n], one._measured(of_cell)).reason
-
-        settled_q_mobile, settled_r_o = (said["condition"] == Condition.SETTLED).T
-        return Estimates(said["q_mobile"], said["r_o"], sd_q_mobile, sd_r_o, settled_q_mobile, settled_r_o, reason_of)
-
-    def _made_with(self) -> dict[str, Any]:
-        return {"cells": len(self.estimators), **self.estimators[0]._made_with()}
-
-    def _arrays(self) -> dict[str, NDArray[Any]]:
-        return {"cells": self._cells, "filters": self._filters}
+        return {"cell": self._cell, "filters": self._filters}
 
 
 def _verdict(first: Sequence[int], r_o_comes_first: bool, shown: Mapping[str, Any]) -> Verdict:
@@ -417,7 +337,7 @@ def _pair(values: tuple[float, float]) -> tuple[float, float]:
 
 @compiled
 def _follow_all(
-    cells: NDArray[np.void],
+    one: NDArray[np.void],
     filters: NDArray[np.void],
     samples: NDArray[np.void],
     settings: Settings,
@@ -425,19 +345,19 @@ def _follow_all(
     derivatives: PolynomialDerivatives,
     estimates: NDArray[np.void],
 ) -> None:
-    # every sample of every cell, into the estimate after it
-    for n in range(samples.shape[1]):
-        cell, bank, seen = cells[n], cells[n].bank, cells[n].seen
-        of_cell = PackedConstants(cell.constants, packed.polynomial_n, packed.polynomial_p)
-        for k in range(samples.shape[0]):
-            sample = samples[k, n]
-            voltage, current, duration = sample.voltage_V, sample.current_A, sample.dt_s
-            begin(seen, duration)
-            examine(seen, voltage, current, bank.mean[Q], bank.mean[R], settings.cell_q_mobile)
-            # a voltage that does not follow its current corrects nothing
-            belonging_V = voltage if belongs(seen) else nan
-            take(cell, filters[n], sample, belonging_V, settings, of_cell, derivatives)
-            if seen.samples > 1 and duration > 0.0:
-                gaps.follow(seen, belonging_V, current, bank.expected_V, bank.mean[Q])
-            conclude(cell, settings, estimates[k, n])
-            remember(seen, voltage, current, sample.read_A)
+    # every sample of a cell, an array of no dimension, into the estimate after it
+    cell: Any = one[()]
+    bank, seen = cell.bank, cell.seen
+    of_cell = PackedConstants(cell.constants, packed.polynomial_n, packed.polynomial_p)
+    for k in range(len(samples)):
+        sample = samples[k]
+        voltage, current, duration = sample.voltage_V, sample.current_A, sample.dt_s
+        begin(seen, duration)
+        examine(seen, voltage, current, bank.mean[Q], bank.mean[R], settings.cell_q_mobile)
+        # a voltage that does not follow its current corrects nothing
+        belonging_V = voltage if belongs(seen) else nan
+        take(cell, filters, sample, belonging_V, settings, of_cell, derivatives)
+        if seen.samples > 1 and duration > 0.0:
+            gaps.follow(seen, belonging_V, current, bank.expected_V, bank.mean[Q])
+        conclude(cell, settings, estimates[k])
+        remember(seen, voltage, current, sample.read_A)

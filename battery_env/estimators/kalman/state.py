@@ -1,6 +1,6 @@
 """
 What a Kalman filter is told, and what it remembers of a discharge: tables with named columns, which compiled code (numba)
-reads and writes in place. A single filter has tables of one row, a batch one row a cell.
+reads and writes in place.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Settings(NamedTuple):
     cell_sd_r_o: float  # what the constants of that cell leave open of ``r_o``, ohm
 
 
-#: One sample of one cell; its current is the mean until the next one, and was read at its time.
+#: One sample; its current is the mean until the next one, and was read at its time.
 SAMPLE = table("voltage_V current_A dt_s temperature_K read_A")
 
 #: What is said after a sample, with the :class:`~battery_env.estimators.diagnosis.Condition` that speaks first against each
