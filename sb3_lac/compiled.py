@@ -2,6 +2,7 @@
 
 import inspect
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -11,6 +12,8 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.sac.policies import Actor
+
+from sb3_lac.buffers import Samples
 
 # The first version that traces gradients within a graph
 _OLDEST_TORCH = "2.11"
@@ -96,6 +99,17 @@ def same_distributions(model: Any) -> Iterator[None]:
             values.update(old)
 
 
+def tensors_of(*values: Any) -> list[th.Tensor]:
+    """The tensors in samples, in their order."""
+    found = []
+    for value in values:
+        if isinstance(value, th.Tensor):
+            found.append(value)
+        elif value is not None:
+            found += tensors_of(*(value.values() if isinstance(value, dict) else value))
+    return found
+
+
 def check_compiler(device: th.device) -> None:
     """Compile something, before a model has collected its first transitions."""
     try:
@@ -107,12 +121,73 @@ def check_compiler(device: th.device) -> None:
         ) from error
 
 
+class Graph:
+    """
+    Compiled code, as a function of all tensors that an update reads. A GPU replays it at one launch (CUDA graph) as soon as it
+    has run once on tensors that are still where they were, apart from samples.
+
+    :param function: The code
+    :param sampled: The parts of samples that the update is made with
+    :param on_gpu: Whether it runs there
+    """
+
+    def __init__(self, function: Callable[..., Sequence[th.Tensor]], sampled: Sequence[th.Tensor], on_gpu: bool) -> None:
+        self._function = function
+        self._sampled = sampled
+        self._on_gpu = on_gpu
+        self._inputs: list[th.Tensor] = []
+        # Where parts of samples are among the inputs, and which of them
+        self._parts: dict[int, int] = {}
+        self._addresses: list[int] = []
+        self._cuda_graph: th.cuda.CUDAGraph | None = None
+        self._copies: list[th.Tensor] = []
+        self._outputs: Sequence[th.Tensor] = ()
+
+    def __call__(self, *inputs: th.Tensor) -> Sequence[th.Tensor]:
+        """As PyTorch calls it, after it has checked that the code is still that of the update."""
+        self._inputs = list(inputs)
+        known = {id(part): index for index, part in enumerate(self._sampled)}
+        self._parts = {at: known[id(each)] for at, each in enumerate(inputs) if id(each) in known}
+        return self._run()
+
+    def again(self, sampled: Sequence[th.Tensor]) -> th.Tensor:
+        """Run on other samples of the same form, without that check, and return the one output, the metrics."""
+        for at, index in self._parts.items():
+            self._inputs[at] = sampled[index]
+        (metrics,) = self._run()
+        return metrics
+
+    def _run(self) -> Sequence[th.Tensor]:
+        if not self._on_gpu:
+            return self._function(*self._inputs)
+        addresses = [each.data_ptr() for at, each in enumerate(self._inputs) if at not in self._parts]
+        if addresses != self._addresses:
+            self._addresses, self._cuda_graph = addresses, None
+            return self._function(*self._inputs)
+        if self._cuda_graph is None:
+            self._capture()
+        th._foreach_copy_(self._copies, [self._inputs[at] for at in self._parts])
+        self._cuda_graph.replay()
+        # The next replay overwrites them
+        return [output.clone() for output in self._outputs]
+
+    def _capture(self) -> None:
+        """Record what the GPU is to do, without doing it."""
+        inputs = self._inputs.copy()
+        for at in self._parts:
+            inputs[at] = inputs[at].clone()
+        self._copies = [inputs[at] for at in self._parts]
+        self._cuda_graph = th.cuda.CUDAGraph()
+        with th.cuda.graph(self._cuda_graph):
+            self._outputs = self._function(*inputs)
+
+
 class CompiledUpdate:
     """
-    The update of a model as one graph without breaks, which a GPU replays at one launch (CUDA graph). It is compiled at its
-    first call, and again when something has changed that it took for constant.
+    The update of a model as one graph without breaks. It is compiled at its first call, and again when something has changed
+    that it took for constant. That is looked at once in a call of ``train()``.
 
-    :param update: The update, a function of the model and of what else changes from one to the next
+    :param update: The update, a function of the model, of samples, and of what else changes from one to the next
     :param device: Device of the model
     """
 
@@ -136,15 +211,30 @@ class CompiledUpdate:
         run.__code__ = run.__code__.replace()
         self._made_from = update, device
         self._on_gpu = device.type == "cuda"
-        mode = "reduce-overhead" if self._on_gpu else None
-        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=BACKEND, mode=mode)
+        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=self._compile)
         # One per group of parameters. A number would be a constant of the graph
         self._learning_rates: list[th.Tensor] = []
         self._space: spaces.Space = _NUMBERS
+        # The parts of the samples at hand, and the code that PyTorch has chosen for them
+        self._sampled: list[th.Tensor] = []
+        self._graph: Graph | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A graph belongs to this process and its model
         return type(self), self._made_from
+
+    def _compile(self, traced: th.fx.GraphModule, inputs: list[th.Tensor]) -> Callable[..., Sequence[th.Tensor]]:
+        """Make code of an update that was traced."""
+        from torch import _dynamo as dynamo
+
+        print("sb3_lac compiles the update of LAC: this takes half a minute to minutes.", file=sys.stderr, flush=True)
+        graph = Graph(dynamo.lookup_backend(BACKEND)(traced, inputs), self._sampled, self._on_gpu)
+
+        def call(*args: th.Tensor) -> Sequence[th.Tensor]:
+            self._graph = graph
+            return graph(*args)
+
+        return call
 
     @contextmanager
     def ready(self, model: Any, optimizers: Sequence[th.optim.Optimizer]) -> Iterator[Callable[..., Metrics]]:
@@ -162,9 +252,6 @@ class CompiledUpdate:
             if isinstance(space, spaces.Dict):
                 self._space = spaces.Dict(dict.fromkeys(space.spaces, _NUMBERS))
             self._learning_rates = [th.zeros((), device=model.device) for _ in groups]
-            # CUDA graphs read and write them where they are
-            for tensor in (*self._learning_rates, *(parameter for group in groups for parameter in group["params"])):
-                dynamo.mark_static_address(tensor)
         for group, learning_rate in zip(groups, self._learning_rates, strict=True):
             # Adam divides by a rate that is a tensor
             learning_rate.fill_(max(group["lr"], _SMALLEST_RATE))
@@ -176,15 +263,22 @@ class CompiledUpdate:
                     parameter.grad = None
                 elif parameter.grad is None:
                     parameter.grad = th.zeros_like(parameter)
-                    dynamo.mark_static_address(parameter.grad)
+        # Code for samples of a form, and whether targets are updated, that was checked in this call
+        checked: dict[Any, tuple[Graph, tuple[str, ...]]] = {}
 
-        def update(replay_data: Any, *args: Any) -> Metrics:
+        def update(replay_data: Samples, costs: th.Tensor, update_targets: bool) -> Metrics:
             parts = {name: getattr(replay_data, name) for name in ("observations", "next_observations")}
             parts = {name: preprocess_obs(part, space, policy.normalize_images) for name, part in parts.items()}
-            # A replay of a CUDA graph overwrites what the one before returned
-            th.compiler.cudagraph_mark_step_begin()
-            names, values = self._run(model, replay_data._replace(**parts), *args)
-            return names, values.clone()
+            replay_data = replay_data._replace(**parts)
+            self._sampled[:] = tensors_of(replay_data, costs)
+            form = update_targets, *((part.shape, part.stride(), part.dtype) for part in self._sampled)
+            if form in checked:
+                graph, names = checked[form]
+                return names, graph.again(self._sampled)
+            names, values = self._run(model, replay_data, costs, update_targets)
+            assert self._graph is not None
+            checked[form] = self._graph, names
+            return names, values
 
         try:
             for network in networks:
@@ -196,3 +290,5 @@ class CompiledUpdate:
                 network.observation_space = space
             for group, old in zip(groups, before, strict=True):
                 group.update(old)
+            # Batches may be large
+            self._sampled.clear()

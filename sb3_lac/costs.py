@@ -3,6 +3,7 @@
 import math
 import os
 import warnings
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,11 +13,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import Actor
 
+from sb3_lac.buffers import Samples, batches_at_once, split
 from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, same_distributions, update_multiplier
 from sb3_lac.discounts import stated_discount
 from sb3_lac.files import replacing
@@ -54,6 +56,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         lambda_learning_rate: float | Schedule | None,
         reward_bound: float | None,
         compile_update: bool,
+        check_observations: bool = True,
         **kwargs: Any,
     ):
         super().__init__(
@@ -77,6 +80,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self.lambda_learning_rate = lambda_learning_rate
         self.reward_bound = reward_bound
         self.compile_update = compile_update
+        self.check_observations = check_observations
         self._compiled: CompiledUpdate | None = None
 
     def _setup_model(self) -> None:
@@ -213,8 +217,13 @@ class CostAlgorithm(OffPolicyAlgorithm):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         prepared = super()._setup_learn(*args, **kwargs)
         first = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
-        refuse_what_is_not_finite("environment gave the first observation", first, self.num_timesteps)
+        self._refuse_observation("first observation", first)
         return prepared
+
+    def _refuse_observation(self, name: str, value: Any) -> None:
+        """Refuse one that is not finite, unless the features extractor is said to handle it."""
+        if self.check_observations:
+            refuse_what_is_not_finite(f"environment gave the {name}", value, self.num_timesteps)
 
     def _store_transition(
         self,
@@ -230,10 +239,13 @@ class CostAlgorithm(OffPolicyAlgorithm):
         said, paid = new_obs, reward
         if vec_normalize is not None:
             said, paid = vec_normalize.get_original_obs(), vec_normalize.get_original_reward()
-        last = [infos[index].get("terminal_observation") for index in np.flatnonzero(dones)]
+        # An environment may pay a list
+        paid = np.asarray(paid)
         refuse_what_is_not_finite("policy gave the action", buffer_action, self.num_timesteps)
-        for name, value in (("reward", paid), ("observation", said), *(("last observation", obs) for obs in last)):
-            refuse_what_is_not_finite(f"environment gave the {name}", value, self.num_timesteps)
+        refuse_what_is_not_finite("environment gave the reward", paid, self.num_timesteps)
+        self._refuse_observation("observation", said)
+        for index in np.flatnonzero(dones):
+            self._refuse_observation("last observation", infos[index].get("terminal_observation"))
         if self._n_updates == 0:
             self._terminations.see(paid, dones, infos)
         # The largest reward of a step, which n-step returns do not tell
@@ -248,7 +260,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
             self.update_offset(vec_normalize)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
-    def costs(self, replay_data: ReplayBufferSamples) -> th.Tensor:
+    def costs(self, replay_data: Samples) -> th.Tensor:
         """
         Get the costs of sampled transitions, of which none is negative. The bound follows rewards that are computed only then
         (HER), or that were stored elsewhere; of the latter, n-step returns only tell their mean.
@@ -264,7 +276,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         bound = th.maximum(self.cost_bound(vec_normalize), largest_reward)
         return bound * n_rewards - replay_data.rewards
 
-    def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
+    def _update(self, replay_data: Samples, costs: th.Tensor, update_targets: bool) -> Metrics:
         """One update of all that is learned. It may be compiled: nothing in it may wait for a value on the host."""
         raise NotImplementedError
 
@@ -288,6 +300,21 @@ class CostAlgorithm(OffPolicyAlgorithm):
             metrics["ent_coef_loss"] = update_multiplier(self.log_ent_coef, self.ent_coef_optimizer, entropy_violation)
         return metrics
 
+    def _batches(self, number: int, batch_size: int) -> Iterator[tuple[Samples, th.Tensor]]:
+        """Sample batches and their costs, many at once where the replay buffer allows it."""
+        assert self.replay_buffer is not None
+        at_once = batches_at_once(self.replay_buffer, batch_size)
+        for first in range(0, number, at_once):
+            n_batches = min(at_once, number - first)
+            sampled = self.replay_buffer.sample(n_batches * batch_size, env=self._vec_normalize_env)
+            replay_data = Samples.of(sampled)
+            refuse_samples(replay_data, self.num_timesteps, self.check_observations)
+            costs = self.costs(replay_data)
+            if n_batches == 1:
+                yield replay_data, costs
+            else:
+                yield from zip(split(replay_data, n_batches), split(costs, n_batches), strict=True)
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         if self._n_updates == 0:
             self._terminations.warn_if_free(self.n_costs, float(self.largest_reward))
@@ -306,18 +333,15 @@ class CostAlgorithm(OffPolicyAlgorithm):
         # The buffer, or the discount, may have been set by hand
         self._adopt_replay_buffer()
 
-        # Kept on the device until the end: each value that is read waits for all pending work, as one look at the samples does
+        # Kept on the device until the end: each value that is read waits for all pending work
         names: tuple[str, ...] = ()
         metrics_per_step: list[th.Tensor] = []
 
         ready = nullcontext(self._update) if self._compiled is None else self._compiled.ready(self, optimizers)
         with same_distributions(self), ready as update:
-            for gradient_step in range(gradient_steps):
-                # Sample replay buffer
-                replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-                refuse_samples(replay_data, self.num_timesteps)
+            for gradient_step, (replay_data, costs) in enumerate(self._batches(gradient_steps, batch_size)):
                 update_targets = (self._n_updates + gradient_step) % self.target_update_interval == 0
-                names, metrics = update(replay_data, self.costs(replay_data), update_targets)
+                names, metrics = update(replay_data, costs, update_targets)
                 metrics_per_step.append(metrics)
 
         self._n_updates += gradient_steps
@@ -446,15 +470,19 @@ def refuse_what_is_not_finite(name: str, value: Any, step: int) -> None:
             refuse_what_is_not_finite(f"{name} {key!r}", part, step)
     elif value is not None and np.asarray(value).dtype.kind == "f" and not np.isfinite(value).all():
         found = np.asarray(value)[~np.isfinite(value)].ravel()[0]
-        raise ValueError(f"The {name} {found} at step {step}: all must be finite. See check_env().")
+        remedy = (
+            " A features extractor that handles such numbers needs check_observations=False." if "observation" in name else ""
+        )
+        raise ValueError(f"The {name} {found} at step {step}: all must be finite. See check_env().{remedy}")
 
 
-def refuse_samples(replay_data: ReplayBufferSamples, step: int) -> None:
+def refuse_samples(replay_data: Samples, step: int, check_observations: bool) -> None:
     """The same for samples: rewards may be computed only then (HER), and a buffer may have been filled elsewhere."""
-    named = [(name, each.values() if isinstance(each, dict) else [each]) for name, each in replay_data._asdict().items()]
-    parts = [(name, part) for name, each in named for part in each if part is not None]
-    # One question for the whole batch: a sum is finite where all its terms are
-    if not th.isfinite(th.stack([part.sum() for _, part in parts])).all():
+    names = ("actions", "rewards", "observations", "next_observations") if check_observations else ("actions", "rewards")
+    named = [(name, getattr(replay_data, name)) for name in names]
+    parts = [(name, part) for name, each in named for part in (each.values() if isinstance(each, dict) else [each])]
+    # One question for all: a sum is finite where all its terms are
+    if not math.isfinite(sum(part.sum() for _, part in parts if part.is_floating_point())):
         for name, part in parts:
             refuse_what_is_not_finite(f"replay buffer gave {name} with", part.numpy(force=True), step)
 

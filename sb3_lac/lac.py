@@ -4,10 +4,11 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
+from sb3_lac.buffers import Samples
 from sb3_lac.compiled import Metrics, set_gradients, step
 from sb3_lac.costs import CostAlgorithm
 from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy, RootCritic, largest_value
@@ -86,6 +87,8 @@ class LAC(CostAlgorithm):
         reward is seen, or if ``None``, it is the largest one seen. ``gamma`` must be below 1 with a bound above 0.
     :param compile_update: Whether to compile each update to one graph (``torch.compile``), on a GPU a CUDA graph. It
         needs torch 2.11, and takes minutes at the first update and when a constant like ``batch_size`` has changed.
+    :param check_observations: Whether to refuse an observation that is not finite. ``False`` is for a features extractor that
+        handles such numbers: NaN as a reading that is missing, inf as nothing in range.
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
         instead of action noise exploration (default: False)
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
@@ -139,6 +142,7 @@ class LAC(CostAlgorithm):
         lambda_learning_rate: float | Schedule | None = None,
         reward_bound: float | None = None,
         compile_update: bool = False,
+        check_observations: bool = True,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -174,6 +178,7 @@ class LAC(CostAlgorithm):
             lambda_learning_rate=lambda_learning_rate,
             reward_bound=reward_bound,
             compile_update=compile_update,
+            check_observations=check_observations,
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
             policy_kwargs=policy_kwargs,
@@ -189,7 +194,7 @@ class LAC(CostAlgorithm):
         if _init_setup_model:
             self._setup_model()
 
-    def _target_values(self, replay_data: ReplayBufferSamples, next_actions: th.Tensor) -> th.Tensor:
+    def _target_values(self, replay_data: Samples, next_actions: th.Tensor) -> th.Tensor:
         """What the critic learns the root of: values of ``L``, relative to its offset."""
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
@@ -206,7 +211,7 @@ class LAC(CostAlgorithm):
         """What the actor lowers, given the roots at its actions."""
         return self.critic.distance(roots).mean()
 
-    def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
+    def _update(self, replay_data: Samples, costs: th.Tensor, update_targets: bool) -> Metrics:
         # We need to sample because `log_std` may have changed between two gradient steps
         if self.use_sde:
             self.actor.reset_noise()

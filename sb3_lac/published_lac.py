@@ -6,12 +6,12 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
-from sb3_lac.buffers import HorizonReplayBuffer
+from sb3_lac.buffers import HorizonReplayBuffer, Samples
 from sb3_lac.compiled import Metrics, set_gradients, step
 from sb3_lac.costs import CostAlgorithm, check_rate
 from sb3_lac.policies import PublishedCnnPolicy, PublishedMultiInputPolicy, PublishedPolicy, largest_value
@@ -67,9 +67,9 @@ class PublishedLAC(CostAlgorithm):
     :param lambda_max: Upper limit of ``lambda`` [C]. If ``None``, it is 1, or ``lambda_init`` if that is larger.
     :param reward_bound: Largest reward that the environment can pay, see ``LAC``
     :param compile_update: Whether to compile each update to one graph, see ``LAC``
-    :param kwargs: ``n_steps`` (not of the paper, and not with a ``horizon``), ``use_sde``, ``sde_sample_freq``,
-        ``use_sde_at_warmup``, ``stats_window_size``, ``tensorboard_log``, ``policy_kwargs``, ``verbose``, ``seed`` and
-        ``device``, as those of ``LAC``
+    :param kwargs: ``n_steps`` (not of the paper, and not with a ``horizon``), ``check_observations``, ``use_sde``,
+        ``sde_sample_freq``, ``use_sde_at_warmup``, ``stats_window_size``, ``tensorboard_log``, ``policy_kwargs``, ``verbose``,
+        ``seed`` and ``device``, as those of ``LAC``
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
@@ -179,7 +179,7 @@ class PublishedLAC(CostAlgorithm):
     def n_costs(self) -> float:
         return super().n_costs if self.horizon is None else self.horizon
 
-    def _candidate(self, replay_data: Any, costs: th.Tensor) -> th.Tensor:
+    def _candidate(self, replay_data: Samples, costs: th.Tensor) -> th.Tensor:
         """The Lyapunov candidate, the target of ``L``."""
         if self.horizon is not None:
             # A cost is the bound less the reward
@@ -192,7 +192,7 @@ class PublishedLAC(CostAlgorithm):
             next_values = (1 - replay_data.dones) * next_values + replay_data.dones * self.critic.offset
             return costs + discounts * next_values
 
-    def _update(self, replay_data: ReplayBufferSamples, costs: th.Tensor, update_targets: bool) -> Metrics:
+    def _update(self, replay_data: Samples, costs: th.Tensor, update_targets: bool) -> Metrics:
         # We need to sample because `log_std` may have changed between two gradient steps
         if self.use_sde:
             self.actor.reset_noise()

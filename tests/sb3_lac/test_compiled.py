@@ -18,7 +18,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 from torch._dynamo.backends.common import aot_autograd
 from torch._functorch.aot_autograd import make_boxed_func
-from torch._guards import TracingContext
 from torch.torch_version import TorchVersion
 
 from sb3_lac import LAC, PublishedLAC, compiled
@@ -42,7 +41,7 @@ def make_model(make_model):
     return _make_model
 
 
-def trained(model, calls=3, gradient_steps=2):
+def trained(model, calls=3, gradient_steps=3):
     """The model after updates on the same batches whatever the model, and what it logged."""
     np.random.seed(0)
     th.manual_seed(0)
@@ -156,12 +155,11 @@ def test_constants_may_change(make_model):
 
 
 def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
-    """CUDA graphs take tensors that are changed where they are, need no value on the CPU, and have outputs of their own."""
+    """CUDA graphs change tensors where they are, but no samples, need no value on the CPU, and have one output."""
     graphs = []
 
     def compiler(graph, inputs):
-        static = TracingContext.get().fw_metadata.static_input_indices
-        graphs.append((graph.graph, static))
+        graphs.append(graph.graph)
         return make_boxed_func(graph.forward)
 
     backend = aot_autograd(fw_compiler=compiler, keep_inference_input_mutations=True)
@@ -169,7 +167,7 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
     model = make_model(compile_update=True, use_sde=True, algorithm=PublishedLAC)
     graphs.clear()
     trained(model, calls=2)
-    ((graph, static),) = graphs
+    (graph,) = graphs
     inputs = graph.find_nodes(op="placeholder")
     copies = graph.find_nodes(op="call_function", target=th.ops.aten.copy_.default)
     changed = {inputs.index(node.args[0]) for node in copies}
@@ -177,9 +175,9 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
     n_targets = sum(len(list(module.parameters())) for module in (model.actor_target, model.critic_target))
     # Weight, gradient, both moments and number of steps
     assert len(changed) == 5 * n_learned + n_targets
-    assert changed <= set(static)
     # Sampled: observations, actions, next observations and ends; and their costs
-    assert len(inputs) - len(static) == 5
+    sampled = {at for at, node in enumerate(inputs) if node.meta["val"].shape[:1] == (model.batch_size,)}
+    assert len(sampled) == 5 and not changed & sampled
     assert len(graph.find_nodes(op="output")[0].args[0]) == 1
     assert not any("local_scalar_dense" in str(node.target) for node in graph.nodes)
 
@@ -205,6 +203,22 @@ def test_any_replay_buffer_and_vec_normalize(make_model, n_updates):
     model = make_model(env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, n_collect=39, compile_update=True)
     model.learn(7, reset_num_timesteps=False)
     assert n_updates(model) == 6 and th.isfinite(model.log_lambda).all()
+
+
+def test_what_is_constant_is_looked_at_once_a_call_and_compilation_is_said(make_model, monkeypatch, capsys):
+    looks = []
+    again = compiled.Graph.again
+    monkeypatch.setattr(compiled.Graph, "again", lambda self, sampled: looks.append("code") or again(self, sampled))
+    call = compiled.Graph.__call__
+    monkeypatch.setattr(compiled.Graph, "__call__", lambda self, *inputs: looks.append("PyTorch") or call(self, *inputs))
+    model = make_model(compile_update=True, n_collect=40)
+    capsys.readouterr()
+    trained(model, calls=2)
+    assert looks == 2 * ["PyTorch", "code", "code"]
+    # Another form of samples is another graph
+    model.train(2, batch_size=8)
+    assert looks[6:] == ["PyTorch", "code"]
+    assert capsys.readouterr().err.count("compiles the update of LAC") == 2
 
 
 def test_old_torch_is_refused(make_model, monkeypatch):

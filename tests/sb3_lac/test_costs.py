@@ -12,9 +12,10 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
-import sb3_lac.envs  # noqa: F401  # registers the ids
+from sb3_lac import LAC
 
 
 class Priced(gym.Wrapper):
@@ -168,6 +169,40 @@ def test_what_is_not_finite_is_refused_before_it_is_stored(make_model, make_env,
         model.learn(20)
     assert model._n_updates == 0 and model.replay_buffer.pos <= 4
     assert np.isfinite(model.replay_buffer.rewards).all()
+
+
+class FillingExtractor(FlattenExtractor):
+    """Readings that are missing are zero."""
+
+    def forward(self, observations):
+        return super().forward(observations.nan_to_num(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("where", ["first observation", "observation", "last observation", "reward"])
+def test_observations_are_left_to_an_extractor_that_handles_them(make_model, make_env, tmp_path, where):
+    policy_kwargs = {"features_extractor_class": FillingExtractor}
+    model = make_model(Spoilt(make_env(), where, np.nan), n_collect=0, check_observations=False, policy_kwargs=policy_kwargs)
+    if where == "reward":
+        with pytest.raises(ValueError, match="The environment gave the reward nan at step"):
+            model.learn(60)
+        return
+    model.learn(60)
+    assert model._n_updates == 20 and all(th.isfinite(tensor).all() for tensor in model.policy.state_dict().values())
+    model.save(tmp_path / "model")
+    assert LAC.load(tmp_path / "model").check_observations is False
+
+
+def test_rewards_may_be_a_list(make_model, make_env):
+    class Listed(VecEnvWrapper):
+        def reset(self):
+            return self.venv.reset()
+
+        def step_wait(self):
+            observations, rewards, dones, infos = self.venv.step_wait()
+            return observations, rewards.tolist(), dones, infos
+
+    model = make_model(Listed(make_vec_env(lambda: make_env(offset=3.0), 2)), n_collect=60)
+    assert model.largest_reward.item() == model.replay_buffer.rewards.max() > 0
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,7 @@ def test_arguments_are_those_of_sac_and_the_own_ones_follow_target_entropy():
     parameters, sac_parameters = (list(inspect.signature(cls.__init__).parameters.values()) for cls in (LAC, SAC))
     names = [parameter.name for parameter in parameters]
     own = ["alpha3", "lambda_init", "lambda_min", "lambda_max", "lambda_learning_rate", "reward_bound", "compile_update"]
+    own.append("check_observations")
     start = names.index("target_entropy") + 1
     assert names[start : start + len(own)] == own
     shared = [(parameter.name, parameter.default) for parameter in parameters if parameter.name not in own]
