@@ -75,11 +75,14 @@ def roll_out(
     episodes: int,
     seed: int = EVALUATION_SEED,
 ) -> pd.DataFrame:
-    """Run the mean action of a policy in all episodes at once, and return one row per episode."""
+    """
+    Run the mean action of a policy in all episodes at once, and return one row per episode. A cost is minus a reward; errors
+    are those that a cost environment tells.
+    """
     envs = [make_env() for _ in range(episodes)]
     starts = [env.reset(seed=seed + episode) for episode, env in enumerate(envs)]
     observations = np.array([observation for observation, _ in starts])
-    errors_at_start = [info["error"] for _, info in starts]
+    errors_at_start = [info.get("error", np.nan) for _, info in starts]
     costs, errors = np.zeros(episodes), np.zeros(episodes)
     lengths, died = np.zeros(episodes, dtype=int), np.zeros(episodes, dtype=bool)
     running = np.arange(episodes)
@@ -87,9 +90,9 @@ def roll_out(
         actions, _ = policy.predict(observations[running], deterministic=True)
         going_on = []
         for episode, action in zip(running, actions, strict=True):
-            observations[episode], _, terminated, truncated, info = envs[episode].step(action)
-            costs[episode] += info["cost"]
-            errors[episode] = info["error"]
+            observations[episode], reward, terminated, truncated, info = envs[episode].step(action)
+            costs[episode] -= float(reward)
+            errors[episode] = info.get("error", np.nan)
             lengths[episode] += 1
             died[episode] = terminated
             if not (terminated or truncated):

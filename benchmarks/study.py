@@ -45,7 +45,10 @@ SYMBOLS = {"q_mobile": "q_max", "r_o": "R_o"}
 #: Seed of evaluations; no training seed comes close.
 EVALUATION_SEED = 10_000
 
-_PACKAGES = ("torch", "stable_baselines3", "gymnasium", "numpy", "numba", "scipy", "pandas", "rl_zoo3", "progpy")
+_PACKAGES = (
+    *("torch", "stable_baselines3", "sb3_contrib", "gymnasium", "mujoco"),
+    *("numpy", "numba", "scipy", "pandas", "rl_zoo3", "progpy"),
+)
 
 
 def own_versions() -> dict[str, str]:

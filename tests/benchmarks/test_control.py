@@ -36,8 +36,8 @@ class CountdownEnv(gym.Env):
     def step(self, action):
         self.n_steps += 1
         observation = np.full(2, self.n_steps, np.float32)
-        info = {"cost": float(self.n_steps), "error": 10.0 - self.n_steps}
-        return observation, 0.0, self.dies and self.n_steps == 3, self.n_steps == 5, info
+        info = {"error": 10.0 - self.n_steps}
+        return observation, -float(self.n_steps), self.dies and self.n_steps == 3, self.n_steps == 5, info
 
 
 def test_costs_lengths_and_deaths_are_those_of_each_episode():

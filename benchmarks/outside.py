@@ -1,0 +1,252 @@
+"""
+LAC beside SAC, TD3 and TQC on tasks of Gymnasium, which nobody here made or tuned for.
+
+.. code-block:: bash
+
+  python -m benchmarks.outside --jobs 2
+  python -m benchmarks.outside --tasks Pendulum-v1 --algos lac sac --seeds 1 2
+  python -m benchmarks.outside --minutes 8 --jobs 16 --out rows
+  python -m benchmarks.outside --merge rows/runs.csv --redraw
+
+Every algorithm has its defaults, but SAC, TD3 and TQC those settings of the RL Zoo that are tuned for a task with at most 50
+thousand steps. ``lac_common`` is LAC with its one setting for control problems. A policy is judged by its mean action, in 20
+episodes that no training starts with. The first seed comes first, on all tasks, so that what is there early says something on
+each. A training that is done is a row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command
+goes on from there, and several work at it together.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+from scipy.stats import bootstrap
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from battery_env.plotting import coloured, draw_over_seeds
+from benchmarks.control import roll_out
+from benchmarks.runs import POINTS, Rows, Run, Trainer, setting_of_lac
+from benchmarks.study import Study, command_line, digits, importable, markdown, natural, new_panels, positive, with_interval
+
+#: Environment steps of each task, the cheap ones first.
+TASKS = {
+    "Pendulum-v1": 20_000,
+    "MountainCarContinuous-v0": 20_000,
+    "InvertedPendulum-v5": 20_000,
+    "InvertedDoublePendulum-v5": 20_000,
+    "Reacher-v5": 20_000,
+    "Pusher-v5": 20_000,
+    "Hopper-v5": 50_000,
+}
+#: Algorithms by their names on the command line: what readers call them, and the class.
+ALGORITHMS = {
+    "lac": ("LAC", "sb3_lac:LAC"),
+    "published_lac": ("LAC as published", "sb3_lac:PublishedLAC"),
+    "lac_common": ("LAC, its one setting", "sb3_lac:LAC"),
+    "sac": ("SAC", "stable_baselines3:SAC"),
+    "td3": ("TD3", "stable_baselines3:TD3"),
+    "tqc": ("TQC", "sb3_contrib:TQC"),
+}
+RIVALS = ("sac", "td3", "tqc")
+_CAR = {
+    "learning_rate": 3e-4,
+    "buffer_size": 50_000,
+    "batch_size": 512,
+    "ent_coef": 0.1,
+    "train_freq": 32,
+    "gradient_steps": 32,
+    "gamma": 0.9999,
+    "tau": 0.01,
+    "learning_starts": 0,
+    "use_sde": True,
+    "policy_kwargs": "dict(log_std_init=-3.67, net_arch=[64, 64], use_expln=True)",
+}
+#: The RL Zoo's settings for a task, where it tunes for at most 50 thousand steps.
+TUNED: dict[str, dict[str, dict[str, Any]]] = {
+    "Pendulum-v1": {
+        "sac": {"learning_rate": 1e-3},
+        "td3": {
+            "gamma": 0.98,
+            "buffer_size": 200_000,
+            "learning_starts": 10_000,
+            "noise_type": "normal",
+            "noise_std": 0.1,
+            "gradient_steps": 1,
+            "train_freq": 1,
+            "learning_rate": 1e-3,
+            "policy_kwargs": "dict(net_arch=[400, 300])",
+        },
+        "tqc": {"learning_rate": 1e-3},
+    },
+    "MountainCarContinuous-v0": {"sac": _CAR, "tqc": _CAR},
+}
+EPISODES = 20
+_CURVE = {100 * point // POINTS: f"after_{100 * point // POINTS}_percent" for point in range(1, POINTS + 1)}
+RETURN = _CURVE[100]
+
+
+def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -> Run:
+    """A training of this study."""
+    settings = setting_of_lac() if algorithm == "lac_common" else TUNED.get(task, {}).get(algorithm, {})
+    return Run(task, algorithm, ALGORITHMS[algorithm][1], seed, timesteps or TASKS[task], settings)
+
+
+def mean_return(model: OffPolicyAlgorithm, task: str) -> float:
+    """Of the held-out episodes."""
+    outcome = roll_out(model, partial(gym.make, task), EPISODES)
+    return -float((outcome["cost"] * outcome["length"]).mean())
+
+
+def difference(ours: np.ndarray, others: np.ndarray, axis: int = -1) -> np.ndarray:
+    """How much larger the mean of our scores is."""
+    return np.asarray(ours.mean(axis) - others.mean(axis))
+
+
+def improvement(*scores: np.ndarray, axis: int = -1) -> np.ndarray:
+    """
+    The probability that one of our scores is above one of the others', mean over tasks, where equal ones are half above
+    (Agarwal et al. 2021).
+
+    :param scores: ours and the others' of a task, then of the next
+    """
+    of_tasks = []
+    for ours, others in zip(scores[::2], scores[1::2], strict=True):
+        gain = np.moveaxis(ours, axis, -1)[..., :, None] - np.moveaxis(others, axis, -1)[..., None, :]
+        of_tasks.append((0.5 * (1.0 + np.sign(gain))).mean((-2, -1)))
+    return np.mean(of_tasks, axis=0)
+
+
+def _interval(statistic: Any, scores: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """With the 95 % interval of a bootstrap in which the scores of each task and algorithm are drawn by themselves."""
+    middle = float(statistic(*scores))
+    if min(map(len, scores)) < 2:
+        return middle, np.nan, np.nan
+    drawn = bootstrap(scores, statistic, vectorized=True, n_resamples=2000, method="percentile", random_state=0)
+    return middle, float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
+
+
+def comparison(rows: pd.DataFrame) -> pd.DataFrame:
+    """LAC by its defaults against each rival, on each task and on all that both have rows of."""
+    scores = {key: group[RETURN].to_numpy() for key, group in rows.groupby(["task", "algorithm"], sort=False)}
+    found = []
+    for rival in RIVALS:
+        tasks = [task for task in TASKS if (task, "lac") in scores and (task, rival) in scores]
+        for task in tasks:
+            pair = [scores[task, "lac"], scores[task, rival]]
+            found.append([task, rival, *_interval(difference, pair), *_interval(improvement, pair)])
+        if len(tasks) > 1:
+            of_all = [scores[task, algorithm] for task in tasks for algorithm in ("lac", rival)]
+            found.append(["all", rival, *[np.nan] * 3, *_interval(improvement, of_all)])
+    of_difference, of_probability = ([name, f"{name}_low", f"{name}_high"] for name in ("difference", "probability"))
+    return pd.DataFrame(found, columns=["task", "rival", *of_difference, *of_probability])
+
+
+def report(rows: pd.DataFrame, compared: pd.DataFrame) -> str:
+    """Two tables, as Markdown."""
+    returns = [
+        {"task": task, "steps": str(of_task["timesteps"].max()), "seeds": _seeds(of_task)}
+        | {
+            label: with_interval(own[RETURN]) if len(own := of_task[of_task["algorithm"] == name]) else ""
+            for name, (label, _) in ALGORITHMS.items()
+        }
+        for task, of_task in rows.groupby("task", sort=False)
+    ]
+    cells = [
+        {
+            "task": row["task"],
+            "LAC against": ALGORITHMS[row["rival"]][0],
+            "difference of means": "" if row["task"] == "all" else _with_bounds(row, "difference"),
+            "probability of improvement": _with_bounds(row, "probability"),
+        }
+        for row in compared.to_dict("records")
+    ]
+    text = "Return of the mean action at the end, interquartile mean over seeds with its 95 % interval, higher is better:\n\n"
+    text += markdown(returns)
+    if cells:
+        text += "\nLAC by its defaults against each other one, with 95 % intervals; above 0, and above 0.5, LAC is ahead:\n\n"
+        text += markdown(cells)
+    return text
+
+
+def _seeds(of_task: pd.DataFrame) -> str:
+    counts = of_task.groupby("algorithm")["seed"].nunique()
+    return str(counts.min()) if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"
+
+
+def _with_bounds(row: Mapping[Any, Any], name: str) -> str:
+    middle, low, high = (digits(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
+    return f"{middle} [{low}, {high}]"
+
+
+def plot_learning(rows: pd.DataFrame) -> Figure:
+    """The return of the mean action while policies are trained: interquartile mean over seeds, in a band of its interval."""
+    tasks = list(rows["task"].unique())
+    figure, panels = new_panels(len(tasks), 4, (3.1, 2.3), margin=(0.0, 0.4))
+    handles: dict[str, Artist] = {}
+    for axes, task in zip(panels, tasks, strict=True):
+        of_task = rows[rows["task"] == task]
+        for colour, (label, name) in coloured((label, name) for name, (label, _) in ALGORITHMS.items()):
+            own = of_task[of_task["algorithm"] == name]
+            if len(own):
+                steps = np.array(list(_CURVE)) / 100 * own["timesteps"].iloc[0]
+                draw_over_seeds(axes, steps, own[list(_CURVE.values())], colour, label)
+        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        axes.set_title(task, fontsize=10)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.25)
+    for axes in panels[::4]:
+        axes.set_ylabel("return")
+    for axes in panels[-4:]:
+        axes.set_xlabel("environment steps")
+    entries = list(handles.values()), list(handles)
+    figure.legend(*entries, loc="outside lower center", ncols=6, frameon=False, fontsize="small")
+    return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = command_line("outside", __doc__)
+    parser.set_defaults(out=Path("docs/results/outside"))
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=list(TASKS))
+    parser.add_argument("--algos", nargs="+", default=list(ALGORITHMS), choices=list(ALGORITHMS))
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[1, 2, 3, 4, 5])
+    parser.add_argument("--timesteps", type=positive, help="environment steps of every task; those of the study by default")
+    parser.add_argument("--compile", action="store_true", help="compile the updates of LAC; minutes are then no comparison")
+    parser.add_argument("--minutes", type=positive, help="then trainings stop, with a checkpoint, and none begins")
+    parser.add_argument("--checkpoints", type=Path, default=Path("results/outside"), help="folder of trainings in progress")
+    parser.add_argument("--merge", nargs="+", type=Path, default=[], metavar="CSV", help="tables whose rows are taken in, too")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    for name in ("minutes", "checkpoints", "merge"):
+        del study.configuration[name]
+    rows = Rows(study.out / "runs.csv")
+    for file in chosen.merge:
+        rows.merge(file)
+    runs = [
+        run_of(task, algorithm, seed, chosen.timesteps)
+        for seed, task, algorithm in product(chosen.seeds, sorted(chosen.tasks, key=list(TASKS).index), chosen.algos)
+    ]
+    if not study.redraws:
+        deadline = time.time() + 60 * chosen.minutes if chosen.minutes else np.inf
+        trainer = Trainer(rows.file, chosen.checkpoints, importable(mean_return), deadline=deadline, compiled=chosen.compile)
+        study.each(trainer, [(run,) for run in runs if not rows.has(run)])
+    done = rows.of(runs)
+    if done.empty:
+        print("No training is done yet: the same command goes on from the checkpoints.")
+        return
+    compared = comparison(done)
+    study.write({"comparison": compared}, {"learning": plot_learning(done)}, report(done, compared))
+
+
+if __name__ == "__main__":
+    main()
