@@ -65,10 +65,13 @@ class CalibrationCallback(EventCallback):
         The first one decides which model is the best. By default ``<parameter>_mape_percent`` for each parameter that the
         training environment finds (its ``task.parameters``), the mean errors in ``battery_env.evaluate()``.
     :param log_path: Path of a CSV file, updated at each evaluation. If it exists already, its evaluations are kept and
-        count for the best model, so that the history of a continued training is complete.
+        count for the best model, so that the history of a continued training is complete
+        (``learn(..., reset_num_timesteps=False)``). A training that starts anew is refused, whose evaluations it would mix in.
     :param best_model_save_path: Path to a folder where the best model (lowest mean of the first metric) will be saved
         as ``best_model.zip``.
-    :param callback_after_eval: Callback to trigger after every evaluation
+    :param callback_after_eval: Callback to trigger after every evaluation. ``StopTrainingOnNoModelImprovement`` asks for
+        ``self.parent.best_mean_reward``, minus the lowest mean of the first metric: ``StopTrainingOnRewardThreshold(-1.0)``
+        stops at 1.
     :param verbose: Verbosity level: 0 for no output, 1 for indicating information about evaluation results
     """
 
@@ -109,7 +112,14 @@ class CalibrationCallback(EventCallback):
         columns = [f"{parameter}_mape_percent" for parameter in self.training_env.get_attr("task", indices=0)[0].parameters]
         return {column: column for column in columns}
 
+    @property
+    def best_mean_reward(self) -> float:
+        """What the callbacks of Stable-Baselines3 that stop a training ask for: the higher, the better."""
+        return -self.best_objective
+
     def _init_callback(self) -> None:
+        if self.log_path is not None:
+            self._continue_log(self.log_path)
         if not self.metrics:
             self.metrics = self._default_metrics()
         if self.eval_freq > 0:
@@ -117,12 +127,20 @@ class CalibrationCallback(EventCallback):
             self._summarize(self.evaluate(self.model))
         if self.best_model_save_path is not None:
             self.best_model_save_path.mkdir(parents=True, exist_ok=True)
-        if self.log_path is not None:
-            self.log_path.parent.mkdir(parents=True, exist_ok=True)
-            if self.log_path.exists():
-                records = pd.read_csv(self.log_path).to_dict("records")
-                self.history = [{str(name): value for name, value in record.items()} for record in records]
-            self.best_objective = min((entry.get(self.objective, np.inf) for entry in self.history), default=np.inf)
+        # An evaluation without a result (NaN) is never the best
+        self.best_objective = float(np.nanmin([np.inf, *(entry.get(self.objective, np.inf) for entry in self.history)]))
+
+    def _continue_log(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists() or path.stat().st_size == 0:
+            return
+        if self.model.num_timesteps == 0:
+            raise ValueError(
+                f"log_path={path} holds the evaluations of another training, and this one starts anew: move the file away, "
+                "give another path, or continue with learn(..., reset_num_timesteps=False)."
+            )
+        records = pd.read_csv(path).to_dict("records")
+        self.history = [{str(name): value for name, value in record.items()} for record in records]
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:

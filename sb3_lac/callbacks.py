@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -26,6 +25,7 @@ from sb3_lac.stability import (
 from sb3_lac.stability.certification import check_bound
 from sb3_lac.stability.loop import check_training_seeds, closed_loop, vectorized
 from sb3_lac.stability.report import critic_of
+from sb3_lac.stability.rollout import mean_reward
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -46,7 +46,8 @@ class LyapunovCallback(EventCallback):
     :param eval_env: The environment used for evaluation, wrapped with ``VecNormalize`` if the training environment is:
         its statistics are synchronized before each evaluation. It cannot be the training environment itself.
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the report in
-        ``self.parent.last_report``
+        ``self.parent.last_report``. ``StopTrainingOnRewardThreshold`` and ``StopTrainingOnNoModelImprovement`` ask for
+        ``self.parent.best_mean_reward``, the largest mean return of an evaluation (of the rewards in the report).
     :param n_eval_episodes: The number of episodes to test the agent
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param seed: Seed of each evaluation, so that all of them have the same start states; if it is None, each draws its own
@@ -56,6 +57,8 @@ class LyapunovCallback(EventCallback):
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
 
+    #: Before the names of what is logged
+    FOLDER: ClassVar[str] = "lyapunov"
     #: Metrics that are logged; SB3 cuts names after 36 characters, and so ``largest_feasible_alpha3`` is ``feasible_alpha3``
     METRICS: ClassVar[tuple[str, ...]] = (
         *("decrease", "share_decreasing", "largest_feasible_alpha3", "mean_cost", "calibration_slope", "rank_correlation"),
@@ -81,6 +84,8 @@ class LyapunovCallback(EventCallback):
         # One entry per evaluation, by timesteps
         self.history: list[dict[str, float]] = []
         self.last_report: LyapunovReport | None = None
+        # What the callbacks of Stable-Baselines3 that stop a training ask for
+        self.best_mean_reward = -np.inf
 
     def _init_callback(self) -> None:
         # A mistake is seen before the training, and not at its first evaluation
@@ -120,11 +125,9 @@ class LyapunovCallback(EventCallback):
             if training.norm_obs:
                 evaluation.obs_rms = deepcopy(training.obs_rms)
 
-        values = self._evaluate()
-        # Dump log so the evaluation results are printed with the correct timestep
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(self.num_timesteps)
-
+        self.best_mean_reward = max(self.best_mean_reward, self._evaluate())
+        values = self._values()
+        self._log(values)
         self.history.append({"timesteps": self.num_timesteps, **values})
         if self.log_path is not None:
             import pandas as pd
@@ -137,13 +140,28 @@ class LyapunovCallback(EventCallback):
         # Trigger callback after every evaluation, if needed
         return self._on_event()
 
-    def _evaluate(self) -> dict[str, float]:
-        """Evaluate, and log what was found."""
-        self.last_report = evaluate_lyapunov(self.model, self.eval_env, self.n_eval_episodes, seed=self.seed)
-        return self._log("lyapunov", self._metrics(), {"report": self.last_report.plot})
+    def _log(self, values: dict[str, float]) -> None:
+        """Log values everywhere; the limits of their intervals, and figures, in TensorBoard only."""
+        in_tensorboard = tensorboard_writer(self.logger) is not None
+        for name, value in values.items():
+            if not name.endswith(("_low", "_high")):
+                self.logger.record(f"{self.FOLDER}/{name}", value)
+            elif in_tensorboard:
+                self.logger.record(f"{self.FOLDER}/{name}", value, exclude=NOT_TENSORBOARD)
+        if in_tensorboard:
+            for name, figure in self._figures().items():
+                self.logger.record(f"{self.FOLDER}/{name}", Figure(figure, close=False), exclude=NOT_TENSORBOARD)
+        # Dump log so the evaluation results are printed with the correct timestep
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
 
-    def _metrics(self) -> dict[str, float]:
-        """Return the metrics that are logged, NaN if there is no report."""
+    def _evaluate(self) -> float:
+        """Make the reports of an evaluation, and return the mean reward of an episode."""
+        self.last_report = evaluate_lyapunov(self.model, self.eval_env, self.n_eval_episodes, seed=self.seed)
+        return mean_reward(self.last_report.transitions)
+
+    def _values(self) -> dict[str, float]:
+        """Return what is logged of the last evaluation, NaN if it has no report."""
         values: dict[str, float] = {}
         for metric in self.METRICS:
             name = metric.removeprefix("largest_")
@@ -151,24 +169,11 @@ class LyapunovCallback(EventCallback):
             values.update(zip((name, f"{name}_low", f"{name}_high"), found, strict=True))
         return values
 
-    def _log(
-        self, folder: str, values: dict[str, float], figures: dict[str, Callable[[], MatplotlibFigure]]
-    ) -> dict[str, float]:
-        """Log values everywhere; the limits of their intervals, and figures, in TensorBoard only."""
-        in_tensorboard = tensorboard_writer(self.logger) is not None
-        for name, value in values.items():
-            if not name.endswith(("_low", "_high")):
-                self.logger.record(f"{folder}/{name}", value)
-            elif in_tensorboard:
-                self.logger.record(f"{folder}/{name}", value, exclude=NOT_TENSORBOARD)
-        if in_tensorboard:
-            for name, draw in figures.items():
-                self.logger.record(f"{folder}/{name}", Figure(draw(), close=False), exclude=NOT_TENSORBOARD)
-        return values
+    def _figures(self) -> dict[str, MatplotlibFigure]:
+        return {} if self.last_report is None else {"report": self.last_report.plot()}
 
     def _summary(self) -> str:
-        assert self.last_report is not None
-        return self.last_report.summary()
+        return "" if self.last_report is None else self.last_report.summary()
 
 
 class CertificateCallback(LyapunovCallback):
@@ -192,9 +197,8 @@ class CertificateCallback(LyapunovCallback):
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
 
-    METRICS: ClassVar[tuple[str, ...]] = (
-        *("largest_feasible_alpha3", "mean_cost", "start_cost", "cost_bound", "ultimate_bound", "death_rate"),
-    )
+    FOLDER = "certificate"
+    METRICS = ("largest_feasible_alpha3", "mean_cost", "start_cost", "cost_bound", "ultimate_bound", "death_rate")
     #: Statements whose bounds are logged
     STATEMENTS: ClassVar[tuple[str, ...]] = ("survives", "stays_within", "decreases")
 
@@ -222,30 +226,34 @@ class CertificateCallback(LyapunovCallback):
     def _judged(self) -> None:
         return None
 
-    def _evaluate(self) -> dict[str, float]:
+    def _evaluate(self) -> float:
         self.last_report = self.last_certification = None
-        n_episodes, n_envs = self.n_eval_episodes, self.eval_env.num_envs
-        figures = {}
+        model, env, n_episodes = self.model, self.eval_env, self.n_eval_episodes
         try:
-            lyapunov = fit_lyapunov(self.model, self.eval_env, n_episodes, seed=self.seed, progress_bar=False)
-        except NoCostError:
-            pass
-        else:
-            seed = lyapunov.seeds.stop
-            judged = (self.model, self.eval_env)
-            self.last_report = evaluate_lyapunov(*judged, n_episodes, seed=seed, lyapunov=lyapunov)
-            self.last_certification = certify(
-                *judged, lyapunov, n_episodes, ultimate_bound=self.ultimate_bound, seed=seed + n_envs
-            )
-            figures = {"drift": self.last_report.plot_drift, "statements": self.last_certification.plot}
-        values = {"holds": np.nan if self.last_report is None else float(self.last_report.holds)}
-        for statement in self.STATEMENTS:
-            # NaN for a statement that no episode could make
-            made = None if self.last_certification is None else self.last_certification.statements["at_least"]
-            values[f"{statement}_at_least"] = np.nan if made is None else float(made.get(statement, np.nan))
-        return self._log("certificate", {**values, **self._metrics()}, figures)
+            lyapunov = fit_lyapunov(model, env, n_episodes, seed=self.seed, progress_bar=False)
+        except NoCostError as nothing:
+            return nothing.mean_reward
+        seed = lyapunov.seeds.stop
+        self.last_report = evaluate_lyapunov(model, env, n_episodes, seed=seed, lyapunov=lyapunov)
+        seed += env.num_envs
+        self.last_certification = certify(model, env, lyapunov, n_episodes, ultimate_bound=self.ultimate_bound, seed=seed)
+        return mean_reward(self.last_report.transitions)
+
+    def _values(self) -> dict[str, float]:
+        # NaN for a statement that no episode could make
+        holds, made = np.nan, dict.fromkeys(self.STATEMENTS, np.nan)
+        if self.last_report is not None and self.last_certification is not None:
+            holds = float(self.last_report.holds)
+            made.update(self.last_certification.statements["at_least"])
+        statements = {f"{statement}_at_least": float(made[statement]) for statement in self.STATEMENTS}
+        return {"holds": holds, **statements, **super()._values()}
+
+    def _figures(self) -> dict[str, MatplotlibFigure]:
+        if self.last_report is None or self.last_certification is None:
+            return {}
+        return {"drift": self.last_report.plot_drift(), "statements": self.last_certification.plot()}
 
     def _summary(self) -> str:
         if self.last_certification is None:
             return "nothing had a cost, and so there is nothing to certify"
-        return "\n".join([self.last_certification.summary(), super()._summary()])
+        return f"{self.last_certification.summary()}\n{super()._summary()}"

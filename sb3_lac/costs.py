@@ -129,9 +129,6 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
         # The multiplier of the decrease condition is learned like that of the entropy
         self.log_lambda, self.lambda_optimizer = self._make_multiplier(self.lambda_init)
-        # Rates that are not those of ``learning_rate``
-        self.critic_lr_schedule: Schedule | None = None
-        self.lambda_lr_schedule = None if self.lambda_learning_rate is None else FloatSchedule(self.lambda_learning_rate)
         self._project_lambda()
 
         if self.compile_update:
@@ -141,6 +138,12 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self.update_offset(self._vec_normalize_env)
         self._terminations = Terminations()
 
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        # Rates that are not those of ``learning_rate``
+        self.critic_lr_schedule: Schedule | None = None
+        self.lambda_lr_schedule = None if self.lambda_learning_rate is None else FloatSchedule(self.lambda_learning_rate)
+
     def _check_arguments(self) -> None:
         """Check the arguments that SAC does not have."""
         needed = self.policy_aliases["MlpPolicy"]
@@ -148,8 +151,16 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if not (issubclass(self.policy_class, needed) and issubclass(*critics)):
             named = self.policy_class.__name__
             raise ValueError(f"{type(self).__name__} needs a policy derived from {needed.__name__}, and this is {named}.")
-        if not (self.action_space.low < self.action_space.high).all():  # type: ignore[attr-defined]
+        with np.errstate(over="ignore"):
+            ranges = self.action_space.high - self.action_space.low  # type: ignore[attr-defined]
+        if not (ranges > 0).all():
             raise ValueError(f"The bounds of {self.action_space} must differ: leave out the actions that cannot be chosen.")
+        if not np.isfinite(ranges).all():
+            raise ValueError(
+                f"The bounds of {self.action_space} are so far apart that their difference, which actions are scaled by, is "
+                "infinite. State those of the actions that are of use, for instance with gymnasium.wrappers.TransformAction("
+                "env, lambda action: action, gymnasium.spaces.Box(-10, 10, env.action_space.shape))."
+            )
         if not 0 <= self.gamma <= 1:
             raise ValueError(f"gamma={self.gamma} must lie within 0 .. 1.")
         if not 0 < self.alpha3 < math.inf:

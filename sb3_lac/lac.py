@@ -87,6 +87,7 @@ class LAC(CostAlgorithm):
         reward is seen, or if ``None``, it is the largest one seen. ``gamma`` must be below 1 with a bound above 0.
     :param compile_update: Whether to compile each update to one graph (``torch.compile``), on a GPU a CUDA graph. It
         needs torch 2.11, and takes minutes at the first update and when a constant like ``batch_size`` has changed.
+        Leave it out where networks have forward hooks, which no graph calls.
     :param check_observations: Whether to refuse an observation that is not finite. ``False`` is for a features extractor that
         handles such numbers: NaN as a reading that is missing, inf as nothing in range.
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 #: What torch and onnxruntime may differ by in any action of the check, relative to the range of the actions
 TOLERANCE = 1e-5
 _N_CHECKED = 64
+_N_TRACED = 2
 _FAR = 1e6
 
 
@@ -121,8 +122,8 @@ def export_onnx(
     :param vec_normalize: What normalizes the observations; by default the wrapper of the model's environment, if it has one. A
         warning says so where there is no environment, as in a policy or in a model that was loaded without one.
     :return: Path of the file
-    :raises ValueError: If its spaces are not ``Box``, if it has a memory, if the file does not do what the policy does, or for
-        models of several spaces
+    :raises ValueError: If its spaces are not ``Box``, if it has a memory, if the file does not do what the policy does or
+        takes one number of observations alone, or for models of several spaces
     :raises FileExistsError: If the file exists
     :raises ImportError: Without the extra
     """
@@ -186,16 +187,23 @@ def _checked_file(
         observations = observations_to_check(policy.observation_space, vec_normalize)
         seen = observations if vec_normalize is None else vec_normalize.normalize_obs(observations)
         expected = np.mean([each.predict(seen, deterministic=True)[0] for each in policies], axis=0)
-        content = with_checksum(graph_of(module, observations, env_id, algorithm).SerializeToString())
+        content = with_checksum(graph_of(module, observations[:_N_TRACED], env_id, algorithm).SerializeToString())
     finally:
         for each, mode in zip(policies, was_training, strict=True):
             each.set_training_mode(mode)
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    (action,) = session.run(None, {"observation": observations})
     ranges = (module.high - module.low).cpu().numpy()
-    error = float(np.max(np.abs(action - expected) / np.where(ranges > 0, ranges, 1.0)))
-    if not error <= TOLERANCE:
-        raise ValueError(f"The exported policy differs from the original by {error:g} of the range of its actions.")
+    for rows in (_N_CHECKED, 1):
+        try:
+            (action,) = session.run(None, {"observation": observations[:rows]})
+        except Exception as error:  # onnxruntime has one for each of its codes
+            raise ValueError(
+                f"The exported policy was traced with {_N_TRACED} observations and does not take {rows}. Where a network has "
+                f"the size of the batch as len(x), write x.shape[0], which a graph can leave open. onnxruntime says: {error}"
+            ) from error
+        difference = float(np.max(np.abs(action - expected[:rows]) / np.where(ranges > 0, ranges, 1.0)))
+        if not difference <= TOLERANCE:
+            raise ValueError(f"The exported policy differs from the original by {difference:g} of the range of its actions.")
     return content
 
 

@@ -82,12 +82,14 @@ class LyapunovCritic(BaseModel):
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
 
-    def outputs(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+    def forward(self, obs: PyTorchObs, actions: th.Tensor, as_values: bool = True) -> tuple[th.Tensor, ...]:
         """
-        Get what the networks give.
+        Get the values ``L(s, a)``, none of them negative, or what the networks give. An update of LAC asks for the latter:
+        forward hooks see that.
 
         :param obs: Observations, preprocessed by ``extract_features()``
         :param actions: As many flat actions in [-1, 1]
+        :param as_values: Whether to get values, of shape (n, 1), or what the networks learn of them
         :return: One tensor of as many rows per critic
         """
         # Learn the features extractor using the policy loss only
@@ -95,15 +97,19 @@ class LyapunovCritic(BaseModel):
         with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
             features = self.extract_features(obs, self.features_extractor)
         lyapunov_input = th.cat([features, actions], dim=1)
-        return tuple(lyapunov_net(lyapunov_input) for lyapunov_net in self.lyapunov_networks)
+        outputs = tuple(lyapunov_net(lyapunov_input) for lyapunov_net in self.lyapunov_networks)
+        return tuple(map(self.lyapunov_of, outputs)) if as_values else outputs
 
-    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+    def outputs(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """Get what the networks give, see ``forward()``."""
+        return self(obs, actions, as_values=False)
+
+    def lyapunov_of(self, output: th.Tensor) -> th.Tensor:
         """
-        Get the values ``L(s, a)``, none of them negative.
+        Get the values of ``L`` that outputs of a network belong to.
 
-        :param obs: Observations, preprocessed by ``extract_features()``
-        :param actions: As many flat actions in [-1, 1]
-        :return: One tensor of shape (n, 1) per critic
+        :param output: What a network gives
+        :return: As many values of shape (n, 1), offset included, and none negative
         """
         raise NotImplementedError
 
@@ -133,8 +139,8 @@ class SumOfSquaresCritic(LyapunovCritic):
             raise ValueError("net_arch must have a layer for the critic: L is the sum of its squares.")
         super().__init__(observation_space, action_space, net_arch, *args, **kwargs)
 
-    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        return tuple(output.square().sum(dim=1, keepdim=True) for output in self.outputs(obs, actions))
+    def lyapunov_of(self, output: th.Tensor) -> th.Tensor:
+        return output.square().sum(dim=1, keepdim=True)
 
 
 class RootCritic(LyapunovCritic):
@@ -159,9 +165,6 @@ class RootCritic(LyapunovCritic):
         # What all values have in common. Set by the algorithm, saved with the weights
         self.floor: th.Tensor
         self.register_buffer("floor", th.zeros(1))
-
-    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        return tuple(self.lyapunov_of(root) for root in self.outputs(obs, actions))
 
     def root(self, values: th.Tensor) -> th.Tensor:
         """
@@ -191,14 +194,8 @@ class RootCritic(LyapunovCritic):
         """
         return roots * roots.abs()
 
-    def lyapunov_of(self, roots: th.Tensor) -> th.Tensor:
-        """
-        Get the values of ``L`` that roots belong to.
-
-        :param roots: What the networks learn
-        :return: As many values, offset included, and none negative
-        """
-        return (self.value(roots) + self.offset).clamp(min=0.0)
+    def lyapunov_of(self, output: th.Tensor) -> th.Tensor:
+        return (self.value(output) + self.offset).clamp(min=0.0)
 
 
 class LyapunovPolicy(SACPolicy):

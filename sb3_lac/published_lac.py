@@ -42,7 +42,8 @@ class PublishedLAC(CostAlgorithm):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...), see ``PublishedPolicy`` for its networks [P]
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param learning_rate: learning rate of the actor and of ``ent_coef`` [P],
-        it can be a function of the current progress remaining (from 1 to 0)
+        it can be a function of the current progress remaining (from 1 to 0).
+        To change it, on a model or on loading, leaves the rates of critic and ``lambda`` as they are.
     :param buffer_size: size of the replay buffer [C]
     :param learning_starts: how many steps of the model to collect transitions for before learning starts [C]
     :param batch_size: Minibatch size for each gradient update [P]
@@ -151,10 +152,13 @@ class PublishedLAC(CostAlgorithm):
             self.replay_buffer_class = HorizonReplayBuffer if plain else self.replay_buffer_class
             self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "horizon": self.horizon}
         super()._setup_model()
-        self.critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
         self.actor_target = self.policy.actor_target
         self.batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
         self.batch_norm_stats_target += get_parameters_by_name(self.actor_target, ["running_"])
+
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        self.critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

@@ -18,7 +18,7 @@ from torch import nn
 from sb3_lac.files import replacing
 from sb3_lac.stability.functions import LyapunovFunction, Observations
 from sb3_lac.stability.loop import closed_loop
-from sb3_lac.stability.rollout import RollOuts, fifths_left, flatten, summarize_episodes
+from sb3_lac.stability.rollout import RollOuts, fifths_left, flatten, mean_reward, summarize_episodes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -238,7 +238,18 @@ def fit_lyapunov(
 
 
 class NoCostError(ValueError):
-    """Nothing had a cost on the roll-outs, so that there is nothing that a Lyapunov function could decrease by."""
+    """
+    Nothing had a cost on the roll-outs, so that there is nothing that a Lyapunov function could decrease by.
+
+    :param mean_reward: Mean over episodes of the sum of their rewards
+    """
+
+    def __init__(self, mean_reward: float):
+        super().__init__(
+            "Nothing had a cost on the roll-outs, and no episode died early, so that L has nothing to decrease by: start "
+            "further away."
+        )
+        self.mean_reward = mean_reward
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,10 +280,7 @@ class _Data:
         # Not the largest cost, which may be that of a death, unless there is no other
         unit = float(np.quantile(costs, 0.9)) or float(costs.max()) or reward_bound * float(n_lost.max())
         if not unit > 0:
-            raise NoCostError(
-                "Nothing had a cost on the roll-outs, and no episode died early, so that L has nothing to decrease by: start "
-                "further away."
-            )
+            raise NoCostError(mean_reward(transitions))
         rows = np.full((len(lengths), lengths.max()), -1)
         rows[episode, step] = np.arange(len(costs))
         inputs = flatten(roll_outs.observations)

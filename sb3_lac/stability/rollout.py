@@ -195,6 +195,11 @@ def fifths_left(transitions: pd.DataFrame) -> pd.Series:
     return (length - transitions["step"] - 1) // np.maximum(length // 5, 1)
 
 
+def mean_reward(transitions: pd.DataFrame) -> float:
+    """Return the mean over episodes of the sum of their rewards."""
+    return float(transitions["reward"].sum() / transitions["episode"].nunique())
+
+
 def summarize_episodes(transitions: pd.DataFrame) -> pd.DataFrame:
     """Summarize each episode."""
     import pandas as pd

@@ -9,7 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from stable_baselines3 import TD3
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    StopTrainingOnNoModelImprovement,
+    StopTrainingOnRewardThreshold,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger, configure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -115,6 +119,17 @@ def test_history_and_best_model_are_saved_and_an_interrupted_run_goes_on(tmp_pat
     assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["best_model.zip", "calibration.csv"]
 
 
+def test_another_training_is_not_mixed_with_a_log(tmp_path):
+    log_path = tmp_path / "calibration.csv"
+    log_path.touch()
+    options = {"eval_freq": 5, "log_path": log_path, "best_model_save_path": tmp_path / "best", "verbose": 0}
+    make_model().learn(5, callback=callback_of(Evaluation(3.0), **options))
+    content = log_path.read_bytes()
+    with pytest.raises(ValueError, match=r"holds the evaluations of another training, and this one starts anew"):
+        make_model().learn(5, callback=callback_of(Evaluation(4.0), **options))
+    assert log_path.read_bytes() == content
+
+
 def test_missing_result_of_a_trajectory_is_not_hidden():
     def evaluate(model):
         return pd.DataFrame({"mape_percent": [1.0, np.nan]})
@@ -143,6 +158,13 @@ def test_a_child_callback_is_triggered_and_can_stop_the_training(capsys):
     assert capsys.readouterr().out.count("New best mape_percent!") == 2
     callback = callback_of(Evaluation(3.0), eval_freq=5, verbose=0, callback_after_eval=Count(stop=True))
     assert make_model().learn(100, callback=callback).num_timesteps == 5
+
+
+def test_callbacks_of_stable_baselines3_stop_the_training():
+    for stop, steps in ((StopTrainingOnNoModelImprovement(1), 20), (StopTrainingOnRewardThreshold(-3.5), 10)):
+        callback = callback_of(Evaluation(4.0, 3.0, 3.0, 5.0, 2.0), eval_freq=5, verbose=0, callback_after_eval=stop)
+        assert make_model().learn(100, callback=callback).num_timesteps == steps
+    assert callback.best_mean_reward == -callback.best_objective == -3.0
 
 
 def test_wrong_columns_are_named_before_the_training(tmp_path):

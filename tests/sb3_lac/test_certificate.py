@@ -543,11 +543,12 @@ def test_callback_logs_the_certificates_of_any_algorithm(make_env, tmp_path):
 
 def test_callback_goes_on_where_nothing_has_a_cost(make_env, capsys):
     model = SAC("MlpPolicy", make_env(), learning_starts=100, policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=0)
-    free = gym.wrappers.TransformReward(make_env(), lambda reward: 0.0)
+    free = gym.wrappers.TransformReward(make_env(), lambda reward: 0.5)
     callback = CertificateCallback(free, n_eval_episodes=2, eval_freq=10)
     assert model.learn(20, callback=callback).num_timesteps == 20
     assert capsys.readouterr().out.count("nothing had a cost") == 2
     assert callback.last_report is None and callback.last_certification is None
+    assert callback.best_mean_reward == 10.0  # of 20 steps
     assert all(np.isnan(value) for name, value in callback.history[0].items() if name != "timesteps")
 
 

@@ -8,6 +8,7 @@ from gymnasium import spaces
 from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from battery_env import OnnxPolicy
@@ -15,6 +16,16 @@ from sb3_lac import LAC, onnx
 from sb3_lac.onnx import export_onnx
 
 SMALL = {"net_arch": [16, 16]}  # copied, since Stable-Baselines3 writes into it
+
+
+class Flat(BaseFeaturesExtractor):
+    """Has the size of the batch as a number that a graph takes for a constant."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, 3)
+
+    def forward(self, observations):
+        return observations.view(len(observations), -1)
 
 
 class Spaces(gym.Env):
@@ -123,6 +134,10 @@ def test_no_damaged_file_answers_otherwise(tmp_path):
         (
             lambda: new_model(PPO, VecFrameStack(VecNormalize(make_vec_env("LinearCost-v0")), 2)),
             r"normalizes observations of shape \(2,\), and those of the policy have \(4,\)",
+        ),
+        (
+            lambda: LAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"features_extractor_class": Flat}, device="cpu"),
+            r"traced with 2 observations and does not take 64.* write x\.shape\[0\]",
         ),
     ],
 )

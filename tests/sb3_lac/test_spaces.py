@@ -59,6 +59,7 @@ def test_arguments_are_those_of_sac_and_the_own_ones_follow_target_entropy():
         (spaces.Discrete(3), "only supports .* as action spaces but Discrete"),
         (spaces.Box(-1, np.inf, (2,)), "must have a finite lower and upper bound"),
         (spaces.Box(np.float32([-1, 0]), np.float32([1, 0])), r"The bounds of Box\(.*\) must differ"),
+        (spaces.Box(-3.4e38, 3.4e38, (2,)), r"The bounds of Box\(-3\.4e\+38.*\) are so far apart.*TransformAction"),
     ],
 )
 def test_only_bounded_continuous_actions_are_supported(make_model, action_space, message):

@@ -10,7 +10,11 @@ import torch as th
 from gymnasium import spaces
 from scipy.stats import spearmanr
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    StopTrainingOnNoModelImprovement,
+    StopTrainingOnRewardThreshold,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, sync_envs_normalization
@@ -441,6 +445,21 @@ def test_callback_logs_the_metrics(make_model, make_env, tmp_path, capsys):
     with pytest.raises(ValueError, match=r"holds the evaluations of another training, and this one starts anew"):
         make_model(n_collect=0).learn(10, callback=callback)
     assert path.read_bytes() == content
+
+
+@pytest.mark.filterwarnings("ignore:Observations lie far")
+@pytest.mark.parametrize("make_callback", [LyapunovCallback, CertificateCallback])
+def test_callbacks_of_stable_baselines3_stop_a_training_after_an_evaluation(make_model, make_env, make_callback):
+    options = {"n_eval_episodes": 4, "eval_freq": 10, "seed": 1000, "verbose": 0}
+    # A policy that never changes: the second evaluation is as good as the first, and the third is one too many
+    model = make_model(n_collect=0, learning_starts=1000, learning_rate=0.0)
+    callback = make_callback(make_env(), StopTrainingOnNoModelImprovement(1), **options)
+    assert model.learn(100, callback=callback).num_timesteps == 30
+    rewards = callback.last_report.transitions.groupby("episode")["reward"].sum()
+    assert callback.best_mean_reward == pytest.approx(rewards.mean())
+    for threshold, steps in ((callback.best_mean_reward - 0.1, 10), (callback.best_mean_reward + 0.1, 40)):
+        stop = StopTrainingOnRewardThreshold(threshold)
+        assert model.learn(40, callback=make_callback(make_env(), stop, **options)).num_timesteps == steps
 
 
 # The functions are fitted on few episodes

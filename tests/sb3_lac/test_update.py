@@ -169,6 +169,18 @@ def test_actor_step_leaves_no_gradient_in_the_critic(make_model, train_metrics):
     assert any(th.any(parameter.grad != 0) for parameter in model.actor.parameters())
 
 
+@pytest.mark.parametrize("algorithm", [LAC, PublishedLAC])
+def test_forward_hooks_of_the_critic_see_the_updates(make_model, train_metrics, algorithm):
+    model = make_model(algorithm=algorithm)
+    batch = model.replay_buffer.sample(16)
+    model.replay_buffer.sample = lambda *args, **kwargs: batch
+    seen = []
+    model.critic.register_forward_hook(lambda critic, inputs, outputs: seen.append((inputs, outputs)))
+    train_metrics(model)
+    inputs, outputs = next(each for each in seen if each[0][1] is batch.actions)
+    assert inputs[0] is batch.observations and [len(output) for output in outputs] == [16] * model.critic.n_critics
+
+
 def test_lambda_has_its_own_learning_rate(make_model, train_metrics):
     def decay(progress_remaining: float) -> float:
         return 0.5 * progress_remaining
@@ -180,6 +192,39 @@ def test_lambda_has_its_own_learning_rate(make_model, train_metrics):
     for optimizer in (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer):
         assert optimizer.param_groups[0]["lr"] == 1e-3
     assert make_model(learning_rate=2e-3, n_collect=0).lambda_optimizer.param_groups[0]["lr"] == 2e-3
+
+
+def changed(model, how, tmp_path, **rates):
+    """The model with other rates, changed as users of Stable-Baselines3 do."""
+    if how == "attribute":
+        for name, rate in rates.items():
+            setattr(model, name, rate)
+        model._setup_lr_schedule()
+        return model
+    model.save(tmp_path / "model")
+    given = rates if how == "argument" else {"custom_objects": rates}
+    loaded = type(model).load(tmp_path / "model", env=model.env, **given)
+    loaded.set_parameters(model.get_parameters())
+    return loaded
+
+
+@pytest.mark.parametrize("how", ["attribute", "argument", "custom_objects"])
+@pytest.mark.parametrize(
+    ("algorithm", "rates", "expected"),
+    [
+        (LAC, {"learning_rate": 1e-5}, (1e-5, 1e-5, 1e-5, 1e-5)),
+        (LAC, {"lambda_learning_rate": 1e-5}, (3e-4, 3e-4, 3e-4, 1e-5)),
+        (PublishedLAC, {"learning_rate": 1e-5}, (1e-5, 1e-5, 3e-4, 1e-4)),
+        (PublishedLAC, {"critic_learning_rate": 1e-5, "lambda_learning_rate": 2e-5}, (1e-4, 1e-4, 1e-5, 2e-5)),
+    ],
+)
+def test_a_rate_that_is_changed_is_the_rate_of_all_that_the_argument_says(
+    make_model, tmp_path, algorithm, rates, expected, how
+):
+    model = changed(make_model(algorithm=algorithm), how, tmp_path, **rates)
+    model.learn(45)
+    optimizers = (model.actor.optimizer, model.ent_coef_optimizer, model.critic.optimizer, model.lambda_optimizer)
+    assert tuple(optimizer.param_groups[0]["lr"] for optimizer in optimizers) == expected
 
 
 def test_fixed_entropy_coefficient_stays(make_model, train_metrics):
