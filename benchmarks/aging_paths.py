@@ -47,12 +47,13 @@ from battery_env.lab.life import Life, track_life
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, RandomLoad, RandomPiecewise, constant
+from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import coloured
+from battery_env.policies.estimator import Predictor
 from battery_env.policies.pretrained import file_stem
 from battery_env.records import drawn
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
 from battery_env.records.model import RecordModel
-from benchmarks.cells import Together
 from benchmarks.study import (
     Study,
     Tables,
@@ -103,6 +104,20 @@ class Loads(RandomLoad):
         if rng.random() < 0.6:
             return constant(float(np.exp(rng.uniform(0.0, np.log(3.0)))), "current")
         return RandomPiecewise((0.5, 3.0), unit="current")(rng)
+
+
+class Together:
+    """Several policies as one: the mean of their actions. None at all leave both parameters to the fit that they would see."""
+
+    def __init__(self, policies: Sequence[Predictor]) -> None:
+        self.policies = policies
+
+    def predict(self, observation: FloatArray, /, *, deterministic: bool = False) -> tuple[FloatArray, None]:
+        """The mean action."""
+        if not self.policies:
+            return np.zeros((len(observation), len(PARAMETER_NAMES))), None
+        actions = [policy.predict(observation, deterministic=deterministic)[0] for policy in self.policies]
+        return np.mean(actions, axis=0), None
 
 
 def path_of(cells: Sequence[str], folder: Path) -> tuple[AgingPath, Path]:

@@ -6,8 +6,6 @@ Calibrators under conditions: how far off each one is, how often what it states 
   python -m benchmarks.calibrators peers               # what a user would pick instead of a learned policy
   python -m benchmarks.calibrators faults              # one thing wrong at a time
   python -m benchmarks.calibrators mismatch            # constants of the model off: the policies that come with battery_env
-  python -m benchmarks.calibrators nuisance            # the same: least squares that estimate such constants as well
-  python -m benchmarks.calibrators mismatch_policies   # the same: LAC, SAC and TD3, trained for it with several seeds
 
 Each is a row of ``COMPARISONS``: its conditions, its calibrators, and its discharges, which start with a full cell at rest,
 under power that changes every 60 to 140 s. Every calibrator starts from a new cell's parameters. Finished parts are not run
@@ -16,12 +14,10 @@ again. Parts that run at the same time (``--jobs``) may cost each other time, wh
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from pathlib import Path
 from textwrap import fill
 from typing import Any, Literal
 
@@ -42,7 +38,7 @@ from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.contests import HELD_OUT, SENSORS
-from benchmarks.pretrained import OPTIONS, TRAINED_WITH
+from benchmarks.pretrained import OPTIONS
 from benchmarks.study import (
     SYMBOLS,
     Study,
@@ -52,11 +48,8 @@ from benchmarks.study import (
     digits,
     duration,
     markdown,
-    natural,
-    positive,
     run_named,
 )
-from benchmarks.training import Recipe, train_or_load
 
 ENV_ID = "BatteryVoltageJoint-v0"
 NOISE_V = 0.005
@@ -67,7 +60,7 @@ MISMATCH = 0.2
 #: Standard deviation of the offset, uniform within 10 mV to either side, V.
 OFFSET_SD_V = 0.01 / np.sqrt(3.0)
 #: Time between the estimates of least squares during a discharge, s.
-WINDOWS_S = {"peers": 60.0, "faults": 300.0, "mismatch": 300.0, "nuisance": 120.0}
+WINDOWS_S = {"peers": 60.0, "faults": 300.0, "mismatch": 300.0}
 #: Standard deviations of the priors of progpy's filters, about the new cell's values, C and ohm.
 PRIOR_SD = {"q_mobile": 1900.0, "r_o": 0.15}
 #: Discharges of calibrators that take milliseconds a sample, for each parameter.
@@ -306,10 +299,9 @@ def _off(mismatch: float) -> tuple[Condition, ...]:
     return tuple(Condition(label, SENSORS[str(label["sensor"])], told_V=None, mismatch=mismatch) for label in labels)
 
 
-_ABOUT_MISMATCH = f"""Held-out discharges of `{ENV_ID}`, both parameters unknown; kn, tDiffusion, to and tsn of each cell are
-off by factors with this relative standard deviation (mismatch)."""
 _MISMATCH = Comparison(
-    f"""{_ABOUT_MISMATCH} Least squares with nuisances are told the truth: which
+    f"""Held-out discharges of `{ENV_ID}`, both parameters unknown; kn, tDiffusion, to and tsn of each cell are
+off by factors with this relative standard deviation (mismatch). Least squares with nuisances are told the truth: which
 constants are off, and by how much. Least squares and filters read every second, the others every two.""",
     _off(0.0) + _off(MISMATCH),
     (
@@ -330,41 +322,10 @@ constants are off, and by how much. Least squares and filters read every second,
     work=_held_out,
 )
 
-_NUISANCE = Comparison(
-    f"""{_ABOUT_MISMATCH} Least squares for q_max and R_o alone, and
-with these constants as nuisances under priors that state it.""",
-    _off(MISMATCH),
-    (
-        _least_squares("two parameters", "model", mismatch_V=MODEL_ERROR_V, window_every_s=WINDOWS_S["nuisance"]),
-        _least_squares(
-            "with nuisance constants", "sizes of errors", nuisance=_NUISANCES, window_every_s=WINDOWS_S["nuisance"]
-        ),
-        _least_squares(
-            "with nuisance constants and offset",
-            "sizes of errors",
-            nuisance={**_NUISANCES, "offset_V": OFFSET_SD_V},
-            window_every_s=WINDOWS_S["nuisance"],
-        ),
-    ),
-    discharges=60,
-    work=_held_out,
-)
-
-_POLICIES = Comparison(
-    f"""{_ABOUT_MISMATCH} Policies that learn as those that come with
-`battery_env` do, each algorithm with its own settings.""",
-    _MISMATCH.conditions,
-    (),
-    discharges=60,
-    work=_held_out,
-)
-
 COMPARISONS = {
     "peers": _PEERS,
     "faults": _FAULTS,
     "mismatch": _MISMATCH,
-    "nuisance": _NUISANCE,
-    "mismatch_policies": _POLICIES,
 }
 
 
@@ -409,29 +370,15 @@ def parts(name: str, n: int) -> list[dict[str, Any]]:
     return chosen
 
 
-def policy_part(algo: str, seed: int, updates: int, discharges: int, folder: Path) -> Tables:
-    """Train a policy, unless that has been done, and score it under all conditions."""
-    recipe = Recipe.of(algo, ENV_ID, seed, updates=updates, hyperparameters={"env_kwargs": TRAINED_WITH})
-    model = train_or_load(recipe, folder / "models")
-    estimator, scores = PolicyEstimator(model, ENV_ID, **OPTIONS), []
-    for condition in _POLICIES.conditions:
-        data = _held_out(condition, PARAMETER_NAMES, discharges)
-        found = evaluate(estimator, data, condition.sensors, seed=_POLICIES.seed)
-        found["cpu_time_per_estimate_s"] = cpu_time_per_estimate_s(estimator, data, slow=False)
-        scores.append(found.assign(calibrator=algo.upper(), seed=seed, **condition.labels))
-    return {"mismatch_policies": pd.concat(scores, ignore_index=True)}
-
-
 def by_parameter(scores: pd.DataFrame, labels: Iterable[str], unknown: Sequence[str] = PARAMETER_NAMES) -> pd.DataFrame:
     """Scores as ``evaluate`` gives them, with a row for each parameter."""
-    keys = [name for name in ("calibrator", "seed", *labels, "parameter", *_MEASURES) if name != "seed" or name in scores]
     tables = [
         scores.rename(columns=lambda column, name=name: column.removeprefix(f"{name}_")).assign(
             parameter=name, true=scores[name]
         )
         for name in unknown
     ]
-    return pd.concat(tables, ignore_index=True)[keys]
+    return pd.concat(tables, ignore_index=True)[["calibrator", *labels, "parameter", *_MEASURES]]
 
 
 def summary(results: pd.DataFrame, labels: Sequence[str], needs: Mapping[str, str]) -> pd.DataFrame:
@@ -439,13 +386,12 @@ def summary(results: pd.DataFrame, labels: Sequence[str], needs: Mapping[str, st
     rows = []
     for keys, group in results.groupby([*labels, "calibrator"], sort=False):
         row = dict(zip([*labels, "calibrator"], keys, strict=True))
+        # published rows are of a policy more, that of an earlier release
         row["needs"] = needs.get(str(row["calibrator"]), _POLICY_NEEDS)
         for parameter, part in group.groupby("parameter", sort=False):
             symbol = SYMBOLS[str(parameter)]
             for words, column in (("2nd half", "second_half_mape_percent"), ("last", "final_error_percent")):
-                seeds = part[column].groupby(part["seed"]) if "seed" in part else [(0, part[column])]
-                means = " / ".join(digits(of_seed.mean(), 3) for _, of_seed in seeds)
-                row[f"{symbol}: {words} (worst), %"] = f"{means} ({digits(part[column].max())})"
+                row[f"{symbol}: {words} (worst), %"] = f"{digits(part[column].mean(), 3)} ({digits(part[column].max())})"
             row[f"{symbol}: within 2 sd, %"] = digits(part["coverage_percent"].mean(), 3)
             lost, settled = part["final_error_percent"] > LOST_PERCENT, np.isfinite(part["settled_time_s"])
             row[f"{symbol}: lost / settled, %"] = f"{100.0 * lost.mean():.0f} / {100.0 * settled.mean():.0f}"
@@ -464,7 +410,7 @@ def report(name: str, results: pd.DataFrame) -> str:
     table = summary(results, list(comparison.conditions[0].labels), {who.name: who.needs for who in comparison.calibrators})
     return f"""{comparison.about}
 
-Errors are means over discharges, one for each seed of policies that are trained here, and (the worst discharge): in the
+Errors are means over discharges, and (the worst discharge): in the
 second half of a discharge, and of the last estimate. Within 2 sd: share of the estimates within two stated standard deviations
 of the truth. Lost: off by more than {LOST_PERCENT:g} % in the end. Settled: the last estimate is taken for settled.
 Within 1 %: from when on all estimates are, median and worst discharge. Bound: the least mean error that the last estimate of
@@ -512,55 +458,32 @@ def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
     return figure
 
 
-def _parser(name: str) -> argparse.ArgumentParser:
+def run(name: str, arguments: Sequence[str]) -> None:
+    """Run one comparison."""
     comparison = COMPARISONS[name]
     parser = command_line(f"calibrators {name}", comparison.about, jobs=1)
     number = at_most(HELD_OUT)
     parser.add_argument("--discharges", type=number, default=comparison.discharges, help="of each condition, at most 300")
-    return parser
-
-
-def _write(study: Study, tables: Tables) -> None:
-    comparison = COMPARISONS[study.name]
+    study = Study(parser, arguments)
+    tables = study.run(part, parts(name, study.chosen.discharges))
     study.configuration |= {
         "conditions": [asdict(condition) for condition in comparison.conditions],
         "calibrators": [{"name": who.name, "policy": who.policy} for who in comparison.calibrators],
         "seed_of_noise": comparison.seed,
-        "window_every_s": WINDOWS_S.get(study.name),
+        "window_every_s": WINDOWS_S.get(name),
         "model_error_V": MODEL_ERROR_V,
         "prior_sd": PRIOR_SD,
         "loads": asdict(RandomPiecewise()),
-        "trained_with": TRAINED_WITH,
     }
-    labels, results = list(comparison.conditions[0].labels), tables[study.name]
+    labels, results = list(comparison.conditions[0].labels), tables[name]
     if not comparison.by_parameter:
         results = by_parameter(results, labels)
-    study.write(tables, {study.name: plot(results, labels)}, report(study.name, results))
-
-
-def run(name: str, arguments: Sequence[str]) -> None:
-    """Compare calibrators that are there."""
-    study = Study(_parser(name), arguments)
-    _write(study, study.run(part, parts(name, study.chosen.discharges)))
-
-
-def run_policies(arguments: Sequence[str]) -> None:
-    """Compare policies that are trained first."""
-    parser = _parser("mismatch_policies")
-    parser.add_argument("--algos", nargs="+", choices=("lac", "sac", "td3"), default=["lac", "sac", "td3"])
-    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2])
-    parser.add_argument("--updates", type=positive, default=5000, help="gradient steps of each training")
-    study = Study(parser, arguments)
-    chosen = study.chosen
-    common = {"updates": chosen.updates, "discharges": chosen.discharges}
-    policies = [{"algo": algo, "seed": seed, **common} for algo in chosen.algos for seed in chosen.seeds]
-    _write(study, study.run(policy_part, policies, folder=study.out))
+    study.write(tables, {name: plot(results, labels)}, report(name, results))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
-    studies = {name: partial(run, name) for name in COMPARISONS} | {"mismatch_policies": run_policies}
-    run_named("calibrators", __doc__, studies, arguments)
+    run_named("calibrators", __doc__, {name: partial(run, name) for name in COMPARISONS}, arguments)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@ Calibrators on the discharges of two real cells, NASA's B0005 and B0006, whole a
 
   python -m benchmarks.cells real_cells       # with the constants of the new cell, over the lives of both
   python -m benchmarks.cells fit_cell         # with constants that were fitted to three discharges of the other cell
-  python -m benchmarks.cells own_cell         # the same: policies that learn on simulations of the fitted cell, beside rivals
-  python -m benchmarks.cells mismatch_cells   # the policies that come with battery_env, beside rivals
 
 *Whole*: the voltage between load-on and 2.7 V. *In progress*: its first 25, 50 and 75 % of the time; how far off is the
 predicted end of discharge? Nothing is known of the parameters of a tested cell but what the name of a calibrator says.
@@ -15,11 +13,8 @@ predicted end of discharge? Nothing is known of the parameters of a tested cell 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict
-from functools import cache, partial
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,34 +22,24 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
-from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
 from battery_env.estimators import CellFit, Estimator, ExtendedKalmanFilter, LeastSquares, fit_cell
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
-from battery_env.loads import recorded
-from battery_env.parameters import PARAMETER_NAMES
-from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, coloured, new_figure, plot_cell_fit, title_of_life
-from battery_env.policies.estimator import PolicyEstimator, Predictor
+from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, new_figure, plot_cell_fit, title_of_life
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.records.model import RecordModel
-from battery_env.trajectories import TrajectoryDataset
-from benchmarks import pretrained
-from benchmarks.calibrators import ENV_ID, SHIPPED, Follow
 from benchmarks.study import (
     Cell,
     Study,
     Tables,
     command_line,
-    digest_of,
     markdown,
-    natural,
     positive,
     run_named,
     share_in_percent,
     table_of,
 )
-from benchmarks.training import Recipe, train_or_load
 
 CUT_OFF_V = 2.7
 #: Shares of a discharge, in time, after which its end is predicted.
@@ -63,13 +48,6 @@ SHARES = (0.25, 0.5, 0.75)
 PAIRS = (("B0005", "B0006"), ("B0006", "B0005"))
 #: About how far q_mobile moves from one discharge to the next, as a share of it (root mean square, measured here).
 PRIOR_SD_SHARE = 0.01
-#: Of the simulated cells that policies learn on: how many, and their ages, C and ohm.
-N_CELLS, Q_MOBILE_RANGE_C, R_O_RANGE_OHM = 1000, (4000.0, 8000.0), (0.06, 0.3)
-#: What rivals with a prior know of ``q_mobile``: mean and standard deviation of that range, C.
-PRIOR_C = (sum(Q_MOBILE_RANGE_C) / 2.0, float(np.ptp(Q_MOBILE_RANGE_C) / np.sqrt(12.0)))
-#: Options of the task in training: as of the policies for recorded cells, but for the mismatch, which is in the data. With
-#: these constants the noise makes the voltage wander by 29 mV, twice the error that the fits leave.
-TRAINED_WITH = {name: value for name, value in (pretrained.TRAINED_WITH | pretrained.RECORDED).items() if name != "mismatch"}
 
 _NEW = Estimate(NEW_CELL.q_mobile, NEW_CELL.r_o)
 _THERMAL = RecordModel(thermal=True)
@@ -108,11 +86,6 @@ def least_squares(prior_q_mobile_C: float | None = None) -> LeastSquares:
     return LeastSquares(thermal=True, mismatch_V=UNFITTED_MISMATCH_V, prior_q_mobile_C=prior)
 
 
-def _filter(**options: Any) -> ExtendedKalmanFilter:
-    # told what a fit expects, 13 to 15 mV, it loses discharges in their first quarter
-    return ExtendedKalmanFilter(mismatch_V=UNFITTED_MISMATCH_V, **options)
-
-
 # over the lives of both cells
 
 
@@ -146,7 +119,7 @@ def life_part(cell: str) -> Tables:
         if previous_C is not None:
             methods = {
                 "least squares alone": least_squares(),
-                "Kalman filter alone": _filter(thermal=True),
+                "Kalman filter alone": ExtendedKalmanFilter(thermal=True, mismatch_V=UNFITTED_MISMATCH_V),
                 "with prior": least_squares(previous_C),
             }
             for share in SHARES:
@@ -354,7 +327,7 @@ def fit_table(scores: pd.DataFrame) -> pd.DataFrame:
 def fit_of_another(arguments: Sequence[str]) -> None:
     """Test constants that were fitted to the other cell."""
     parser = command_line("cells fit_cell", "Fit constants to three discharges of one cell, and test them on the other one.")
-    _add_every(parser)
+    parser.add_argument("--every", type=positive, default=1, help="test on every k-th discharge (default: %(default)s)")
     study = _study(parser, arguments, fitted_to="first, middle and last discharge of the other cell")
     pairs = [{"trained": trained, "tested": tested, "every": study.chosen.every} for trained, tested in PAIRS]
     tables = study.run(fit_part, pairs)
@@ -366,211 +339,6 @@ def fit_of_another(arguments: Sequence[str]) -> None:
     study.write(tables, figures, "\n".join(text), "summary")
 
 
-# calibrators side by side
-
-
-def simulated(fit: CellFit, cell: str, folder: Path) -> Path:
-    """The discharges that policies learn on, unless the file is there."""
-    made_from = {
-        "cell": asdict(fit.cell),
-        "q": Q_MOBILE_RANGE_C,
-        "r": R_O_RANGE_OHM,
-        "mismatch": pretrained.MISMATCH,
-        "n": N_CELLS,
-    }
-    file = folder / f"{cell}_{digest_of(made_from)}.npz"
-    if not file.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        loads = [recorded(discharge.loaded_part(CUT_OFF_V), "power", 1.0) for discharge in load_nasa_discharges(cell)]
-        ranges: dict[str, Any] = {"q_mobile_range": Q_MOBILE_RANGE_C, "r_o_range": R_O_RANGE_OHM}
-        data = TrajectoryDataset.generate(
-            PARAMETER_NAMES, N_CELLS, loads, 0, **ranges, cell=fit.cell, mismatch=pretrained.MISMATCH
-        )
-        with suppress(FileExistsError):  # of another part, which has made the same
-            data.save(file)
-    return file
-
-
-class Together:
-    """Several policies as one: the mean of their actions. None at all leave both parameters to the fit that they would see."""
-
-    def __init__(self, policies: Sequence[Predictor]) -> None:
-        self.policies = policies
-
-    def predict(self, observation: FloatArray, /, *, deterministic: bool = False) -> tuple[FloatArray, None]:
-        """The mean action."""
-        if not self.policies:
-            return np.zeros((len(observation), len(PARAMETER_NAMES))), None
-        actions = [policy.predict(observation, deterministic=deterministic)[0] for policy in self.policies]
-        return np.mean(actions, axis=0), None
-
-
-#: Calibrators without learning, by name, with fitted constants.
-CLASSICAL: dict[str, Callable[[CellFit], Estimator]] = {
-    "least squares": lambda fit: fit.calibrator(),
-    "least squares, prior": lambda fit: fit.calibrator(prior_q_mobile_C=PRIOR_C),
-    "Kalman filter": lambda fit: _filter(cell=fit.cell, thermal=fit.thermal),
-    "Kalman filter, prior": lambda fit: _filter(cell=fit.cell, thermal=fit.thermal, prior_q_mobile_C=PRIOR_C),
-    "the fit that policies see": lambda fit: PolicyEstimator(Follow(), ENV_ID, cell=fit.cell, **pretrained.OPTIONS),
-}
-
-#: By name, calibrators with the constants of the new cell.
-NEW_CELLS: dict[str, Callable[[], Estimator]] = {
-    **{who.name: partial(who.make, PARAMETER_NAMES, None) for who in SHIPPED},
-    "least squares": least_squares,
-    "Kalman filter": lambda: _filter(thermal=True),
-}
-
-
-def trained(algo: str, seed: int, updates: int, dataset: Path, folder: Path) -> Predictor:
-    """A policy for a cell, trained unless that has been done."""
-    chosen = {"env_kwargs": {**TRAINED_WITH, "dataset": str(dataset)}}
-    return train_or_load(Recipe.of(algo, ENV_ID, seed, updates=updates, hyperparameters=chosen), folder)
-
-
-def scored(cell: str, every: int, calibrator: Estimator, model: RecordModel) -> pd.DataFrame:
-    """Let a calibrator estimate the discharges of a cell, in progress and whole."""
-    discharges = load_nasa_discharges(cell)[::every]
-    rows = [row for discharge in discharges for row in estimates(discharge, calibrator, model, (*SHARES, 1.0))]
-    return pd.DataFrame(rows)
-
-
-def own_part(calibrator: str, seeds: list[int], updates: int, fitted: str, tested: str, every: int, folder: Path) -> Tables:
-    """Test one calibrator with the constants of a fitted cell on the other one."""
-    fit = fitted_to(fitted)
-    if calibrator in CLASSICAL:
-        estimator = CLASSICAL[calibrator](fit)
-    else:
-        dataset = simulated(fit, fitted, folder / "data")
-        policies = [trained(calibrator.lower(), seed, updates, dataset, folder / "models") for seed in seeds]
-        policy = policies[0] if len(seeds) == 1 else Together(policies)
-        estimator = PolicyEstimator(policy, ENV_ID, cell=fit.cell, **pretrained.OPTIONS)
-    found = scored(tested, every, estimator, RecordModel(fit.cell, fit.thermal))
-    found.insert(0, "fitted", fitted)
-    found.insert(1, "tested", tested)
-    found.insert(2, "calibrator", calibrator if len(seeds) < 2 else f"{calibrator}, {len(seeds)} together")
-    found.insert(3, "seed", seeds[0] if len(seeds) == 1 else None)
-    return {"own_cell": found.drop(columns="sd_q_mobile_C")}
-
-
-def new_part(calibrator: str, cell: str, every: int, policy: str) -> Tables:
-    """Test one calibrator with the constants of the new cell."""
-    estimator = NEW_CELLS[calibrator]()
-    found = scored(cell, every, estimator, RecordModel(thermal=not isinstance(estimator, PolicyEstimator)))
-    found.insert(0, "calibrator", calibrator)
-    found.insert(1, "cell", cell)
-    return {"mismatch_cells": found.drop(columns="sd_q_mobile_C").assign(policy=policy)}
-
-
-def with_departure(found: pd.DataFrame) -> pd.DataFrame:
-    """
-    How far each estimate of ``q_mobile`` is from that of least squares for the whole discharge, which stand for the truth.
-    """
-    key = ["tested", "cycle"]
-    whole = found[(found["calibrator"] == "least squares") & (found["share"] == 1.0)]
-    truth = whole.set_index(key)["q_mobile_C"].rename("expected_C")
-    joined = found.join(truth, on=key)
-    return joined.assign(departure_percent=100.0 * (joined["q_mobile_C"] / joined["expected_C"] - 1.0))
-
-
-def _over_seeds(rows: pd.DataFrame, column: str, decimals: int) -> str:
-    # mean over discharges: of each seed side by side, and the worst of all
-    means = rows[column].abs().groupby(rows["seed"].fillna(-1)).mean()
-    return f"{' / '.join(f'{mean:.{decimals}f}' for mean in means)} ({rows[column].abs().max():.{decimals - 1}f})"
-
-
-def departure_table(found: pd.DataFrame) -> pd.DataFrame:
-    """The table for readers."""
-    rows = []
-    for (tested, calibrator), of_both in with_departure(found).groupby(["tested", "calibrator"], sort=False):
-        whole = of_both[of_both["share"] == 1.0]
-        mean_C = whole.groupby("cycle")[["q_mobile_C", "capacity_Ah"]].mean()
-        row = {
-            "tested on": tested,
-            "calibrator": calibrator,
-            "q_max of whole discharges, departure: mean (worst) (%)": _over_seeds(whole, "departure_percent", 2),
-            "corr(q_max, capacity)": f"{mean_C['q_mobile_C'].corr(mean_C['capacity_Ah']):.4f}",
-        }
-        for share in SHARES:
-            at_share = of_both[of_both["share"] == share]
-            row[f"end at {100 * share:.0f} %: mean (worst) (%)"] = _over_seeds(at_share, "eod_error_percent", 1)
-        rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def plot_departures(found: pd.DataFrame) -> Figure:
-    """
-    How far ``q_mobile`` of whole discharges is from that of least squares over the life of a cell, and how far off the end of
-    discharge is that is predicted on the way.
-    """
-    names = [name for name in found["calibrator"].unique() if "together" not in name and not name.startswith("the fit")]
-    colours = {family: colour for colour, family in coloured(dict.fromkeys(name.partition(",")[0] for name in names))}
-    figure = new_figure(10.4, 6.6)
-    panels = figure.subplots(2, found["tested"].nunique(), sharey="row", squeeze=False)
-    for (upper, lower), (tested, of_cell) in zip(panels.T, with_departure(found).groupby("tested", sort=False), strict=True):
-        for name in names:
-            family = name.partition(",")[0]
-            of_name, colour = of_cell[of_cell["calibrator"] == name], colours[family]
-            style = "-" if name == family else "--"
-            whole = of_name[of_name["share"] == 1.0].groupby("cycle")["departure_percent"].mean()
-            upper.plot(whole.index, whole, ls=style, lw=1.2, color=colour)
-            in_progress = of_name[of_name["share"] < 1.0]
-            errors = in_progress["eod_error_percent"].abs().groupby(in_progress["share"]).mean()
-            lower.plot(100.0 * errors.index, errors, "o", ls=style, color=colour, label=name)
-        title = f"{tested}, with the constants of {of_cell['fitted'].iloc[0]}"
-        upper.set(title=title, xlabel="cycle", ylabel=f"{LABELS['q_mobile'].split(' (')[0]}, from least squares (%)")
-        lower.set(yscale="log", xlabel="seen of the discharge (%)", ylabel="mean error of its end (%)", xticks=(25, 50, 75))
-        for axes in (upper, lower):
-            axes.grid(alpha=0.25)
-    figure.legend(*panels[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(names), fontsize=8)
-    return figure
-
-
-def own_cell(arguments: Sequence[str]) -> None:
-    """Compare calibrators that have the constants of the other cell."""
-    parser = command_line("cells own_cell", "Policies that learn on simulations of a fitted cell, on the other one.")
-    parser.add_argument("--algos", nargs="+", choices=("lac", "sac", "td3"), default=["lac", "sac", "td3"])
-    parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2])
-    parser.add_argument("--updates", type=positive, default=5000, help="gradient steps of each training")
-    _add_every(parser)
-    study = _study(parser, arguments, trained_with=TRAINED_WITH, prior_C=PRIOR_C)
-    chosen = study.chosen
-    for fitted, _ in PAIRS:
-        simulated(fitted_to(fitted), fitted, study.out / "data")  # here, as parts that make the same file meet
-    pairs = [{"fitted": fitted, "tested": tested, "every": chosen.every} for fitted, tested in PAIRS]
-    alone = [{"calibrator": algo.upper(), "seeds": [seed]} for seed in chosen.seeds for algo in chosen.algos]
-    together = [{"calibrator": algo.upper(), "seeds": chosen.seeds} for algo in chosen.algos if len(chosen.seeds) > 1]
-    tables = []
-    # policies act together when each is trained
-    for who in ([{"calibrator": name, "seeds": []} for name in CLASSICAL], alone, together):
-        parts = [{**one, "updates": chosen.updates, **pair} for pair in pairs for one in who]
-        tables += [study.run(own_part, parts, folder=study.out)] if parts else []
-    found = pd.concat([table["own_cell"] for table in tables], ignore_index=True)
-    found = found.sort_values("tested", kind="stable", ignore_index=True)
-    study.write({"own_cell": found}, {"own_cell": plot_departures(found)}, markdown(departure_table(found)))
-
-
-def mismatch_cells(arguments: Sequence[str]) -> None:
-    """Compare calibrators that have the constants of the new cell."""
-    parser = command_line("cells mismatch_cells", "The policies that come with battery_env, beside rivals.", jobs=1)
-    parser.add_argument("--cells", nargs="+", choices=BUNDLED_CELLS, default=list(BUNDLED_CELLS))
-    _add_every(parser, default=8)
-    study = _study(parser, arguments)
-    policies = {who.name: who.policy for who in SHIPPED}
-    parts = [
-        {"calibrator": name, "cell": cell, "every": study.chosen.every, "policy": policies.get(name, "")}
-        for cell in study.chosen.cells
-        for name in NEW_CELLS
-    ]
-    tables = study.run(new_part, parts)
-    found = tables["mismatch_cells"].rename(columns={"cell": "tested"}).assign(seed=None)
-    study.write(tables, {}, markdown(departure_table(found)))
-
-
-def _add_every(parser: argparse.ArgumentParser, default: int = 1) -> None:
-    parser.add_argument("--every", type=positive, default=default, help="test on every k-th discharge (default: %(default)s)")
-
-
 def _study(parser: argparse.ArgumentParser, arguments: Sequence[str], **configuration: Any) -> Study:
     study = Study(parser, arguments)
     common = {"cut_off_V": CUT_OFF_V, "mismatch_V": UNFITTED_MISMATCH_V, "thermal": True, "data": NASA_CITATION}
@@ -578,7 +346,7 @@ def _study(parser: argparse.ArgumentParser, arguments: Sequence[str], **configur
     return study
 
 
-STUDIES = {"real_cells": real_cells, "fit_cell": fit_of_another, "own_cell": own_cell, "mismatch_cells": mismatch_cells}
+STUDIES = {"real_cells": real_cells, "fit_cell": fit_of_another}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -17,15 +17,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
-from battery_env.electrochemistry import simulate
 from battery_env.estimators import ExtendedKalmanFilter, LeastSquares
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
 from battery_env.lab.conversions import capacity_Ah, dc_resistance_ohm
-from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, new_figure
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.records.model import RecordModel
 from benchmarks.study import Study, Tables, command_line, markdown, positive
@@ -40,9 +35,6 @@ _METHODS = {
     "kalman": ExtendedKalmanFilter(thermal=True, mismatch_V=UNFITTED_MISMATCH_V),
 }
 _MODEL = RecordModel(thermal=True)
-# parameters of the curves: the middle one is the same in both panels
-_Q_MOBILE_C, _R_O_OHM = (7000.0, 6000.0, 5000.0), (0.05, 0.12, 0.19)
-_SHADES = ("#0072b2", "#4b4b4b", "#d55e00")
 
 
 def measure(discharge: Discharge) -> dict[str, Any]:
@@ -119,88 +111,6 @@ def _errors(error: pd.Series, digits: int) -> dict[str, str]:
     }
 
 
-def plot_curves() -> Figure:
-    """What either parameter does to the voltage of a discharge."""
-    figure = new_figure(6.4, 3.3)
-    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    pairs = ([(q, _R_O_OHM[1]) for q in _Q_MOBILE_C], [(_Q_MOBILE_C[1], r) for r in _R_O_OHM])
-    for axes, parameters, title in ((left, pairs[0], "smaller $q_{max}$"), (right, pairs[1], "larger $R_o$")):
-        for (q_mobile, r_o), shade in zip(parameters, _SHADES, strict=True):
-            curve = simulate(2.0, q_mobile, r_o, load_unit="current", cut_off_V=CUT_OFF_V)
-            label = f"{q_mobile / 3600.0:.2f} Ah" if axes is left else f"{1e3 * r_o:.0f} m$\\Omega$"
-            axes.plot(curve.time_s / 60.0, curve.voltage_V, color=shade, lw=1.8, label=label)
-        axes.set(xlabel="time at 2 A (min)")
-        axes.set_title(title, fontsize=11)
-        axes.grid(alpha=0.25)
-        axes.legend(
-            title=LABELS["q_mobile" if axes is left else "r_o"].split(" (")[0], frameon=False, fontsize=10, loc="lower left"
-        )
-    left.set_ylabel("voltage (V)")
-    arrow = {"arrowstyle": "-|>", "lw": 2.0, "color": "0.15", "mutation_scale": 16}
-    left.annotate("", (39.8, 3.05), (55.0, 3.05), arrowprops=arrow)
-    left.text(37.2, 3.05, "ends\nearlier", ha="right", va="center", fontsize=10)
-    right.annotate("", (20.0, 3.44), (20.0, 3.71), arrowprops=arrow)
-    right.text(21.5, 3.78, "lies lower", ha="left", va="center", fontsize=10)
-    return figure
-
-
-def plot_model() -> Figure:
-    """The model: where the charge is, and what takes voltage."""
-    figure = new_figure(6.4, 3.0)
-    axes = figure.subplots()
-    axes.set(xlim=(0.0, 16.0), ylim=(0.0, 7.5))
-    axes.axis("off")
-    for x, widths, name, names in (
-        (0.3, (3.4, 1.2), "negative electrode", ("bulk", "surface")),
-        (11.1, (1.2, 3.4), "positive electrode", ("surface", "bulk")),
-    ):
-        for width, kind in zip(widths, names, strict=True):
-            middle, is_bulk = x + width / 2, kind == "bulk"
-            axes.add_patch(Rectangle((x, 1.9), width, 3.0, fc="#cfe3f1" if is_bulk else "#8fbfe0", ec="0.3", lw=1.0))
-            share = "bulk, 90 %" if is_bulk else "surface, 10 %"
-            axes.text(
-                middle, 4.1 if is_bulk else 3.4, share, ha="center", va="center", rotation=0 if is_bulk else 90, fontsize=9
-            )
-            if is_bulk:
-                _arrow(axes, (middle - 1.4, 2.5), (middle + 1.4, 2.5), "diffusion, slow", 0.15)
-            x += width
-        axes.text(x - 2.3, 1.35, name, ha="center", fontsize=10)
-    _arrow(axes, (5.1, 3.2), (10.9, 3.2), "$q_{max}$ from full to empty", 0.2)
-    axes.plot([2.6, 2.6, 6.3], [5.0, 6.5, 6.5], color="0.2", lw=1.2)
-    axes.plot([9.7, 13.4, 13.4], [6.5, 6.5, 5.0], color="0.2", lw=1.2)
-    axes.add_patch(Rectangle((6.3, 6.05), 3.4, 0.9, fc="white", ec=COLOURS[1], lw=1.6))
-    axes.text(8.0, 6.5, "$R_o$ · current", ha="center", va="center", fontsize=10, color=COLOURS[1])
-    formula = "voltage = equilibrium of the surfaces - $R_o$ · current - overpotentials"
-    axes.text(8.0, 0.35, formula, ha="center", fontsize=10)
-    return figure
-
-
-def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], text: str, above: float) -> None:
-    axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "lw": 1.8, "color": COLOURS[0], "mutation_scale": 15})
-    axes.text((start[0] + end[0]) / 2, start[1] + above, text, ha="center", va="bottom", fontsize=10, color=COLOURS[0])
-
-
-def plot_resistances(found: pd.DataFrame) -> Figure:
-    """``R_o`` by both methods over the lives of the cells, beside measured resistances."""
-    cells = list(dict.fromkeys(found["cell"]))
-    figure = new_figure(3.2 * len(cells), 3.6)
-    panels = figure.subplots(1, len(cells), sharey=True, squeeze=False)[0]
-    for axes, cell in zip(panels, cells, strict=True):
-        rows = found[found["cell"] == cell].set_index("cycle")
-        axes.plot(1e3 * rows["least_squares_r_o_ohm"], color=COLOUR_OF["least squares"], lw=1.8, label="$R_o$, least squares")
-        axes.plot(1e3 * rows["kalman_r_o_ohm"], color=COLOUR_OF["Kalman filter"], lw=1.8, label="$R_o$, Kalman filter")
-        axes.plot(1e3 * rows["pulse_ohm"], "o", ms=2.4, color="0.35", label="10 s at full charge, measured")
-        axes.plot(1e3 * (rows["Re_ohm"] + rows["Rct_ohm"]), "+", ms=4, color="0.35", label="$R_e + R_{ct}$, impedance")
-        axes.plot(1e3 * rows["Re_ohm"], "x", ms=3, color="0.6", label="$R_e$, impedance")
-        axes.set_title(cell, fontsize=11)
-        axes.set_xlabel("cycle")
-        axes.grid(alpha=0.25)
-    panels[0].set_ylabel("resistance (m$\\Omega$)")
-    panels[0].set_ylim(bottom=0.0)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=9)
-    return figure
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("parameters", __doc__, jobs=1)
@@ -211,9 +121,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     study.configuration |= {"cut_off_V": CUT_OFF_V, "mismatch_V": UNFITTED_MISMATCH_V, "data": NASA_CITATION}
     tables = study.run(part, [{"cell": cell, "every": chosen.every} for cell in chosen.cells])
     found = tables["resistances"]
-    figures = {"model": plot_model(), "curves": plot_curves(), "resistances": plot_resistances(found)}
     study.write(
-        tables, figures, "\n".join(markdown(each) for each in (resistance_table(found), conversion_table(found))), "summary"
+        tables, {}, "\n".join(markdown(each) for each in (resistance_table(found), conversion_table(found))), "summary"
     )
 
 

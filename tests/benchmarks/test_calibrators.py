@@ -9,11 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import NEW_CELL, PolicyEstimator, SensorErrors, evaluate, simulate, step, voltage
-from battery_env.tasks.data import standard_dataset
+from battery_env import NEW_CELL, SensorErrors, simulate, step, voltage
 from benchmarks import calibrators
-from benchmarks.calibrators import COMPARISONS, Condition, Follow
-from benchmarks.contests import SENSORS
+from benchmarks.calibrators import COMPARISONS, Condition
 
 
 def among(monkeypatch, name, conditions=None, names=None):
@@ -51,7 +49,7 @@ class TestWork:
         assert len(counts["peers"]) == 8 * 2 + 2 * (4 * 2 + 1) and counts["peers"].count(2) == 2 * 2
         # four of five on either parameter, half of the discharges each
         assert len(counts["faults"]) == 7 * 5 + 4 * 2 and counts["faults"].count(15) == 4 * 2
-        assert (len(counts["mismatch"]), len(counts["nuisance"])) == (4 * 6, 2 * 3)
+        assert len(counts["mismatch"]) == 4 * 6
 
 
 def test_peers_are_as_good_as_they_can_be_until_a_sensor_is_wrong(tmp_path, monkeypatch, capsys):
@@ -84,31 +82,10 @@ def test_the_policy_that_comes_with_the_package_says_which_it_is(tmp_path, monke
 
 
 def test_nuisance_constants_make_up_for_those_that_are_off(tmp_path, monkeypatch):
-    among(monkeypatch, "nuisance", slice(0, 1), ("two parameters", "with nuisance constants"))
-    results, _ = make(tmp_path, "nuisance", "--discharges", "2")
+    among(monkeypatch, "mismatch", slice(2, 3), ("least squares, two parameters", "least squares, nuisances, offset"))
+    results, _ = make(tmp_path, "mismatch", "--discharges", "2")
     error = results.groupby("calibrator")["q_mobile_second_half_mape_percent"].mean()
-    assert error["with nuisance constants"] < 0.5 * error["two parameters"]
-
-
-class TestPolicies:
-    def test_every_algorithm_and_seed_is_scored_under_every_condition(self, tmp_path):
-        few = ["--algos", "lac", "td3", "--seeds", "5", "--updates", "4", "--discharges", "1"]
-        scores, text = make(tmp_path, "mismatch_policies", *few)
-        sizes = scores.groupby(["calibrator", "seed", "mismatch", "sensor"]).size()
-        assert (sizes == 1).all() and len(sizes) == 2 * 1 * 2 * 2
-        record = json.loads((tmp_path / "mismatch_policies.json").read_text())["configuration"]
-        assert record["trained_with"]["mismatch"] == 0.2 and record["updates"] == 4
-        assert text.count("| LAC ") == text.count("| TD3 ") == 4
-
-    def test_they_see_discharges_that_they_did_not_learn_on(self, monkeypatch, tmp_path):
-        monkeypatch.setattr(calibrators, "train_or_load", lambda *arguments: Follow())
-        (scores,) = calibrators.policy_part("sac", 3, 8, 2, tmp_path).values()
-        data = standard_dataset(("q_mobile", "r_o"), "piecewise", "test", mismatch=0.2)[:2]
-        estimator = PolicyEstimator(Follow(), calibrators.ENV_ID, **calibrators.OPTIONS)
-        expected = evaluate(estimator, data, SENSORS["5 mV noise"], seed=1)
-        found = scores[(scores["mismatch"] == 0.2) & (scores["sensor"] == "5 mV noise")]
-        assert set(scores["calibrator"]) == {"SAC"} and set(scores["seed"]) == {3}
-        np.testing.assert_array_equal(found["q_mobile_final"], expected["q_mobile_final"])
+    assert error["least squares, nuisances, offset"] < 0.5 * error["least squares, two parameters"]
 
 
 class TestProgpyFilters:

@@ -41,17 +41,16 @@ def test_a_folder_that_cannot_be_is_refused(command, out, tmp_path, capsys):
 REFUSED = {
     "must be at least 1, got": [
         *("compare --timesteps 0", "compare --jobs nan", "compare --jobs inf", "linear_cost --episodes two"),
-        *("cells fit_cell --every 0", "cells own_cell --updates 0.5", "direct_mapping --pairs 0", "forecasts --every 0"),
-        *("identifiability --draws many",),
+        *("cells fit_cell --every 0", "direct_mapping --updates 0.5", "direct_mapping --pairs many", "forecasts --every 0"),
     ],
     "must be a whole number of at least 0, got": [
-        *("compare --seeds -1", "linear_cost --seeds 0.5", "calibrators mismatch_policies --seeds first"),
+        *("compare --seeds -1", "linear_cost --seeds 0.5", "direct_mapping --seeds first"),
     ],
     "must lie within 1 .. 300, got": [
         *("calibrators peers --discharges 0", "calibrators mismatch --discharges 301", "pretrained --discharges 301"),
     ],
     "invalid choice:": [
-        *("calibrators everything", "calibrators mismatch_policies --algos ppo", "cells real_cells --cells B0007"),
+        *("calibrators everything", "direct_mapping --algos ppo", "cells real_cells --cells B0007"),
         *("pretrained --envs BatteryQmax-v0",),
     ],
 }

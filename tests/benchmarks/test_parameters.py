@@ -15,4 +15,3 @@ def test_the_study_compares_estimates_with_what_was_measured(tmp_path, capsys):
     assert (rows["error_to_3_V_percent"].abs() < 2.0 * rows["sd_to_3_V_percent"]).all()
     assert ((rows["kalman_pulse_ohm"] - rows["pulse_ohm"]).abs() < 0.02).all()
     assert "| B0006" in capsys.readouterr().out
-    assert {path.stem for path in tmp_path.glob("*.png")} == {"model", "curves", "resistances"}

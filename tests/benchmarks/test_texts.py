@@ -11,14 +11,12 @@ from benchmarks import (
     calibrators,
     certificate,
     direct_mapping,
-    identifiability,
     linear_cost,
     published,
     references,
     stabilisation,
     throughput,
 )
-from benchmarks.cells import departure_table
 from benchmarks.study import markdown
 
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
@@ -43,16 +41,14 @@ def of_mapping(tables):
 
 REPORTS = {
     "direct_mapping/direct_mapping": of_mapping,
-    "identifiability/summary": identifiability.summary,
     "linear_cost/linear_cost": partial(of_one, linear_cost.report, "linear_cost"),
-    "own_cell/own_cell": lambda tables: markdown(departure_table(tables["own_cell"])),
     "published/published": partial(of_one, published.report, "published"),
     "published_horizons/published": partial(of_one, published.report, "published"),
     "references/references": lambda tables: references.report(tables["references"].fillna({"arguments": ""})),
     "stabilisation/stabilisation": stabilisation.report,
     "stabilisation_long/stabilisation": stabilisation.report,
     "throughput/filters": partial(of_one, throughput.report_filters, "filters"),
-    **{f"{name}/{name}": partial(of_comparison, name) for name in ("faults", "mismatch", "mismatch_policies", "peers")},
+    **{f"{name}/{name}": partial(of_comparison, name) for name in ("faults", "mismatch", "peers")},
 }
 
 
