@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 SOURCES := sb3_lac battery_env benchmarks tests examples docs
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-oldest format lint type-check docs commit-checks clean
+.PHONY: help install demo test test-attacks test-oldest format lint type-check docs commit-checks clean
 
 help:  ## list the commands
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -37,8 +37,11 @@ install: $(VENV)/.installed  ## make .venv with everything in it
 demo: install  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some minutes; figures in results/
 	$(BIN)/python -m benchmarks.demo
 
-test: install  ## all tests
+test: install  ## all tests but attacks
 	$(BIN)/python -m pytest -n 2 --dist worksteal  # neighbours share their fixtures, and no worker is idle in the end
+
+test-attacks: install  ## attacks: sweeps over faults of records, their sizes and their places
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m attacks
 
 test-oldest:  ## those of both packages, with the oldest versions that setup.cfg names of all but torch
 	$(PYTHON) -m venv --clear $(VENV)/oldest
@@ -63,7 +66,7 @@ docs: install  ## the documentation site, in docs/_build/html
 	rm -rf docs/_api  # pages of names that are gone would stay
 	$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build/html
 
-commit-checks: lint type-check docs test  ## everything that must pass before a commit
+commit-checks: lint type-check docs test test-attacks  ## everything that must pass before a commit
 
 clean:  ## remove what the build left (not .venv, not results)
 	rm -rf build docs/_build docs/_api docs/_notebooks *.egg-info battery_env/*.egg-info .pytest_cache .mypy_cache .ruff_cache

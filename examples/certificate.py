@@ -26,7 +26,6 @@ names = ["x (m)", "dx/dt (m/s)", "theta (rad)", "dtheta/dt (rad/s)"]
 report = evaluate_lyapunov(model, gym.make("CartPoleCost-v0", max_episode_steps=600), n_eval_episodes=50, seed=1)
 print(report.summary())
 report.plot().savefig(folder / "certificate.png")
-report.plot_phase(2, 3, names).savefig(folder / "phase.png")
 
 # On a grid, with some noise so that no two episodes are alike: an exact interval for each start
 angles, rates = np.meshgrid(np.linspace(-0.3, 0.3, 13), np.linspace(-3.0, 3.0, 13))

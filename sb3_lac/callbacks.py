@@ -23,7 +23,7 @@ from sb3_lac.stability import (
     fit_lyapunov,
 )
 from sb3_lac.stability.certification import check_bound
-from sb3_lac.stability.loop import check_training_seeds, closed_loop, vectorized
+from sb3_lac.stability.loop import closed_loop, vectorized
 from sb3_lac.stability.report import critic_of
 from sb3_lac.stability.rollout import mean_reward
 
@@ -217,11 +217,6 @@ class CertificateCallback(LyapunovCallback):
         check_bound(ultimate_bound)
         self.ultimate_bound = ultimate_bound
         self.last_certification: CertificationReport | None = None
-
-    def _init_callback(self) -> None:
-        super()._init_callback()
-        if self.seed is not None:
-            check_training_seeds(self.model, range(self.seed, self.seed + 3 * self.eval_env.num_envs))
 
     def _judged(self) -> None:
         return None

@@ -44,8 +44,6 @@ class GymnasiumVecEnv(VecEnv):
             )
         self.env = env
         self._all = np.arange(env.num_envs)
-        #: Seeds of the environments, which count up from the first one, as in Gymnasium; empty if they had none
-        self.last_seeds: list[int] = []
         base = env.unwrapped
         # Gymnasium's own vector environments hold single ones; others compute all of them at once
         self._single_envs = base if isinstance(base, (gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv)) else None
@@ -56,7 +54,6 @@ class GymnasiumVecEnv(VecEnv):
             raise ValueError(
                 f"A vector environment takes the same options for all its environments, not {self._options}: use make_vec_env."
             )
-        self.last_seeds = [seed for seed in self._seeds if seed is not None] or self.last_seeds
         observations, infos = self.env.reset(seed=self._seeds[0], options=self._options[0] or None)
         self.reset_infos = _unbatched(infos, self._all)
         # Seeds and options are only used once

@@ -1,25 +1,20 @@
 """
-RL Zoo with LAC: training, continuing, hyperparameter search, evaluation, videos and plots from the command line.
+RL Zoo with LAC: training, continuing, hyperparameter search and evaluation from the command line.
 
 .. code-block:: bash
 
   python -m sb3_lac.zoo train --env Pendulum-v1
   python -m sb3_lac.zoo train --env Pendulum-v1 -i logs/lac/Pendulum-v1_1/Pendulum-v1.zip
   python -m sb3_lac.zoo enjoy --env Pendulum-v1 -f logs --no-render
-  python -m sb3_lac.zoo record_video --env Pendulum-v1 -f logs
   python -m sb3_lac.zoo optimize --env Pendulum-v1 --n-trials 50
-  python -m sb3_lac.zoo all_plots --algos lac sac --env Pendulum-v1 -f logs
-  python -m sb3_lac.zoo benchmark --log-dir logs --no-hub
 
 Options are those of the RL Zoo's modules of these names, with two other defaults: the algorithm is LAC, and the
-hyperparameters of ``train`` and ``optimize`` are those of ``find_config()``. ``optimize`` has samplers of its own for
-LAC, SAC and TD3, which reach equally far.
+hyperparameters of ``train`` and ``optimize`` are those of ``find_config()``.
 """
 
 import argparse
 import inspect
 import runpy
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -28,12 +23,10 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
@@ -65,7 +58,8 @@ RL_ZOO_CONFIGS = (_RL_ZOO if (_RL_ZOO / "hyperparams").is_dir() else _RL_ZOO.par
 Hyperparams = dict[str, Any]
 
 
-def _sample(trial: optuna.Trial, own: Hyperparams, additional_args: dict[str, Any]) -> Hyperparams:
+def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
+    """Sampler for LAC hyperparams."""
     # n_envs, train_freq and gradient_steps stay those of the configuration: they belong together
     sampled_params = {
         # gamma from 0.5 to 0.9999
@@ -79,33 +73,17 @@ def _sample(trial: optuna.Trial, own: Hyperparams, additional_args: dict[str, An
         "tau": trial.suggest_float("tau", 0.001, 0.08, log=True),
         "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "large"]),
         "activation_fn": trial.suggest_categorical("activation_fn", ["relu", "leaky_relu"]),
-        **own,
+        "ent_coef_init": trial.suggest_float("ent_coef_init", 0.001, 100.0, log=True),
+        # -n_actions is the default
+        "target_entropy": trial.suggest_float("target_entropy", -5.0 * n_actions, 0.0),
+        "n_critics": trial.suggest_categorical("n_critics", [1, 2]),
     }
     # Display true values
     trial.set_user_attr("gamma", 1 - sampled_params["one_minus_gamma"])
     trial.set_user_attr("batch_size", 2 ** sampled_params["batch_size_pow"])
     if additional_args["using_her_replay_buffer"]:
         sampled_params = sample_her_params(trial, sampled_params, additional_args["her_kwargs"])
-    return sampled_params
-
-
-def _sample_entropy_params(trial: optuna.Trial, n_actions: int) -> Hyperparams:
-    return {
-        "ent_coef_init": trial.suggest_float("ent_coef_init", 0.001, 100.0, log=True),
-        # -n_actions is the default of SAC and LAC
-        "target_entropy": trial.suggest_float("target_entropy", -5.0 * n_actions, 0.0),
-    }
-
-
-def _convert_common_params(sampled_params: Hyperparams) -> Hyperparams:
-    hyperparams = convert_offpolicy_params(sampled_params)
-    # Trials of a study of an earlier version do not say
-    if hyperparams.pop("learning_rate_falls", False):
-        hyperparams["learning_rate"] = f"lin_{hyperparams['learning_rate']}"
-    return hyperparams
-
-
-def _as_arguments(hyperparams: Hyperparams) -> Hyperparams:
+    hyperparams = convert_lac_params(sampled_params)
     # The RL Zoo reads schedules from configurations only
     rate = hyperparams["learning_rate"]
     if isinstance(rate, str):
@@ -113,54 +91,15 @@ def _as_arguments(hyperparams: Hyperparams) -> Hyperparams:
     return hyperparams
 
 
-def convert_sac_params(sampled_params: Hyperparams) -> Hyperparams:
-    """Convert sampled values to the hyperparameters of SAC."""
-    hyperparams = _convert_common_params(sampled_params)
-    hyperparams["ent_coef"] = f"auto_{hyperparams.pop('ent_coef_init')}"
-    return hyperparams
-
-
 def convert_lac_params(sampled_params: Hyperparams) -> Hyperparams:
-    """Convert sampled values to the hyperparameters of LAC."""
-    hyperparams = convert_sac_params(sampled_params)
+    """Convert sampled values to the hyperparameters of LAC, as they stand in a configuration of the RL Zoo."""
+    hyperparams = convert_offpolicy_params(sampled_params)
+    # Trials of a study of an earlier version do not say
+    if hyperparams.pop("learning_rate_falls", False):
+        hyperparams["learning_rate"] = f"lin_{hyperparams['learning_rate']}"
+    hyperparams["ent_coef"] = f"auto_{hyperparams.pop('ent_coef_init')}"
     hyperparams["policy_kwargs"]["n_critics"] = hyperparams.pop("n_critics")
     return hyperparams
-
-
-def convert_td3_params(sampled_params: Hyperparams) -> Hyperparams:
-    """Convert sampled values to the hyperparameters of TD3, as they stand in a configuration of the RL Zoo."""
-    hyperparams = _convert_common_params(sampled_params)
-    hyperparams["noise_type"] = "normal"
-    # The ratio of the defaults is 0.5 to 0.2
-    hyperparams["target_noise_clip"] = 2.5 * hyperparams["target_policy_noise"]
-    return hyperparams
-
-
-def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
-    """Sampler for LAC hyperparams."""
-    own = {
-        **_sample_entropy_params(trial, n_actions),
-        "n_critics": trial.suggest_categorical("n_critics", [1, 2]),
-    }
-    return _as_arguments(convert_lac_params(_sample(trial, own, additional_args)))
-
-
-def sample_sac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
-    """Sampler for SAC hyperparams that reaches as far as that of LAC: the RL Zoo's own has gamma >= 0.97 and no entropy."""
-    return _as_arguments(convert_sac_params(_sample(trial, _sample_entropy_params(trial, n_actions), additional_args)))
-
-
-def sample_td3_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
-    """
-    Sampler for TD3 hyperparams that reaches as far as that of LAC: the RL Zoo's own has gamma >= 0.97 and no target noise.
-    """
-    names = ("noise_std", "target_policy_noise")
-    own = {name: trial.suggest_float(name, 0.01, 0.5, log=True) for name in names}
-    hyperparams = _as_arguments(convert_td3_params(_sample(trial, own, additional_args)))
-    # The RL Zoo reads the type of noise from configurations only
-    del hyperparams["noise_type"]
-    sigma = np.full(n_actions, hyperparams.pop("noise_std"))
-    return {**hyperparams, "action_noise": NormalActionNoise(np.zeros(n_actions), sigma)}
 
 
 def steps_as_one_batch(spec: EnvSpec) -> bool:
@@ -306,61 +245,35 @@ def find_config(algo: str, env_id: str | None = None) -> Path:
     return next((path for name in names for path in files if name in _entries(path)), files[0])
 
 
-def _run_benchmark() -> None:
-    # The RL Zoo's calls ``python enjoy.py``, which lies in its own checkout and does not know LAC
-    call = subprocess.call
-    subprocess.call = lambda command: call([sys.executable, "-m", "sb3_lac.zoo", "enjoy", *command[2:]])  # type: ignore
-    try:
-        runpy.run_module("rl_zoo3.benchmark", run_name="__main__")
-    finally:
-        subprocess.call = call
-
-
-_COMMANDS: dict[str, Callable[[], object]] = {
-    "train": lambda: rl_zoo3.train.train(),
-    "optimize": lambda: rl_zoo3.train.train(),
-    "enjoy": lambda: rl_zoo3.enjoy.enjoy(),
-    "record_video": lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"),
-    "benchmark": _run_benchmark,
-    # Slow to import, and nothing else needs them
-    "all_plots": lambda: import_module("rl_zoo3.plots").all_plots(),
-    "plot_train": lambda: import_module("rl_zoo3.plots").plot_train(),
-    "plot_from_file": lambda: import_module("rl_zoo3.plots").plot_from_file(),
-}
-
-
 def main(args: Sequence[str] | None = None) -> None:
     """Run a command of the RL Zoo, with LAC and its hyperparameters as default."""
     prog = "python -m sb3_lac.zoo"
     parser = argparse.ArgumentParser(prog=prog, description="RL Zoo with LAC")
-    parser.add_argument("command", choices=_COMMANDS, help="what to do")
+    parser.add_argument("command", choices=("train", "enjoy", "optimize"), help="what to do")
     parser.add_argument("options", nargs=argparse.REMAINDER, help="options of the RL Zoo, add --help to see them")
     parsed = parser.parse_args(args)
     trains = parsed.command in ("train", "optimize")
 
     # Only the options with another default are read here, the RL Zoo reads all of them from sys.argv
-    options = parsed.options
-    if trains or parsed.command in ("enjoy", "record_video"):
-        defaults = argparse.ArgumentParser(prog=prog, add_help=False)
-        defaults.add_argument("--algo", default="lac")
-        if trains:
-            defaults.add_argument("--env", default="CartPole-v1")
-            defaults.add_argument("-conf", "--conf-file")
-        known, options = defaults.parse_known_args(options)
-        options += ["--algo", known.algo]
-        if trains:
-            options += ["--env", known.env]
-            # The RL Zoo says which algorithms there are
-            with suppress(FileNotFoundError):
-                options += ["--conf-file", known.conf_file or str(find_config(known.algo, known.env))]
+    defaults = argparse.ArgumentParser(prog=prog, add_help=False)
+    defaults.add_argument("--algo", default="lac")
+    if trains:
+        defaults.add_argument("--env", default="CartPole-v1")
+        defaults.add_argument("-conf", "--conf-file")
+    known, options = defaults.parse_known_args(parsed.options)
+    options += ["--algo", known.algo]
+    if trains:
+        options += ["--env", known.env]
+        # The RL Zoo says which algorithms there are
+        with suppress(FileNotFoundError):
+            options += ["--conf-file", known.conf_file or str(find_config(known.algo, known.env))]
     if parsed.command == "optimize":
         options += ["--optimize-hyperparameters"]
-
-    # Here and not where LAC is registered: who imports this module to use ``rl_zoo3.train`` keeps its search for SAC and TD3
-    HYPERPARAMS_SAMPLER.update(sac=sample_sac_params, td3=sample_td3_params)
-    HYPERPARAMS_CONVERTER.update(sac=convert_sac_params, td3=convert_td3_params)
     sys.argv = [f"{prog} {parsed.command}", *options]
-    _COMMANDS[parsed.command]()
+    if trains:
+        rl_zoo3.train.train()
+    else:
+        rl_zoo3.enjoy.enjoy()
 
 
 if __name__ == "__main__":

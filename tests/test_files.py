@@ -16,8 +16,6 @@ from battery_env.loads import constant
 from battery_env.plotting import save_figure
 from benchmarks.study import write_text
 from sb3_lac import LAC
-from sb3_lac.envs import reference_controller
-from sb3_lac.stability.fitting import FittedLyapunov, fit_lyapunov
 from tests.faults import Disk, a_full_disk
 
 OLD, NEW = "old", "new"
@@ -52,13 +50,6 @@ def models():
     return made
 
 
-@pytest.fixture(scope="module")
-def functions(models):
-    env = models[OLD].get_env()
-    controller = reference_controller(env.envs[0])
-    return {which: fit_lyapunov(controller, env.envs[0], 2, seed=which == OLD) for which in (OLD, NEW)}
-
-
 # what writes a file, what reads it, and whether it takes the place of an older one
 WRITERS = {
     "cell.json": (of_constants, CellParameters.from_json, False),
@@ -68,7 +59,6 @@ WRITERS = {
     "table.csv": (of_a_table, None, True),
     "model.zip": ("save", lambda path: LAC.load(path, device="cpu"), True),
     "buffer.pkl": ("save_replay_buffer", lambda path: LAC("MlpPolicy", "LinearCost-v0").load_replay_buffer(path), True),
-    "lyapunov.pt": (None, FittedLyapunov.load, True),
 }
 
 
@@ -82,12 +72,6 @@ def test_whichever_write_sync_or_renaming_fails_the_file_is_whole(name, tmp_path
 
         def write(which, path):
             getattr(models[which], method)(path)
-
-    elif write is None:
-        functions = request.getfixturevalue("functions")
-
-        def write(which, path):
-            functions[which].save(path)
 
     path = tmp_path / name
     write(NEW, path)

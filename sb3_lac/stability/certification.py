@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_lac.stability.functions import LyapunovFunction
-from sb3_lac.stability.loop import ClosedLoop, check_training_seeds, closed_loop
+from sb3_lac.stability.loop import ClosedLoop, closed_loop
 from sb3_lac.stability.rollout import flatten, summarize_episodes
 from sb3_lac.stability.statistics import CONFIDENCE, exact_interval, exact_lower_bound
 
@@ -179,8 +179,8 @@ def certify(
     :param starts: Start states on a grid, shape (n, n_states), each handed to ``env.reset(options={"state": ...})``
     :param n_episodes_per_start: Number of episodes from each of them
     :param deterministic: Whether to certify the mean action or sampled actions
-    :param seed: Seed of the episodes, which cannot be one that ``lyapunov`` was fitted on, or the policy trained; drawn if it
-        is None, and named in the description of the report
+    :param seed: Seed of the episodes, which cannot be one that ``lyapunov`` was fitted on, and should be none that the policy
+        was trained with; drawn if it is None, and named in the description of the report
     :return: The report
     :raises ValueError: If an argument is invalid
     """
@@ -193,7 +193,6 @@ def certify(
                 f"n_episodes_per_start={n_episodes_per_start} at least 1."
             )
     with closed_loop(policy, env, lyapunov, n_episodes, deterministic, seed) as loop:
-        check_training_seeds(policy, loop.seeds)
         if ultimate_bound is None and lyapunov is not None:
             ultimate_bound = lyapunov.ultimate_bound
         attraction = None

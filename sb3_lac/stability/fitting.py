@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import warnings
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import gymnasium as gym
@@ -15,7 +14,6 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_lac.files import replacing
 from sb3_lac.stability.functions import LyapunovFunction, Observations
 from sb3_lac.stability.loop import closed_loop
 from sb3_lac.stability.rollout import RollOuts, fifths_left, flatten, mean_reward, summarize_episodes
@@ -146,40 +144,6 @@ class FittedLyapunov(LyapunovFunction):
         self.inputs.warn_if_far(inputs)
         return np.maximum(self.unit * self.network.values(self.inputs.scaled(inputs)) - self.floor, 0.0)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """
-        Save the function. The file is never there in part.
-
-        :param path: Name of the file
-        """
-        numbers = ("unit", "floor", "average_cost", "reward_bound", "ultimate_bound", "level", "window_steps", "alpha3")
-        content = {
-            "network": self.network.state_dict(),
-            "inputs": {field.name: th.as_tensor(getattr(self.inputs, field.name)) for field in fields(InputRange)},
-            # Of Python, for a scalar of numpy would keep the file from being loaded
-            "numbers": {name: np.asarray(getattr(self, name)).item() for name in numbers},
-            "seeds": (self.seeds.start, self.seeds.stop),
-        }
-        with replacing(path) as part:
-            th.save(content, part)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> FittedLyapunov:
-        """
-        Load a function that was saved. Nothing in the file is executed.
-
-        :param path: Name of the file
-        :return: The function
-        """
-        content = th.load(path, map_location="cpu", weights_only=True)
-        inputs = InputRange(**{name: tensor.numpy() for name, tensor in content["inputs"].items()})
-        network = SumOfSquares(len(inputs.mean))
-        network.load_state_dict(content["network"])
-        alpha3 = content["numbers"].pop("alpha3", 1.0)
-        lyapunov = cls(network, inputs, seeds=range(*content["seeds"]), **content["numbers"])
-        lyapunov.alpha3 = alpha3
-        return lyapunov
-
 
 def fit_lyapunov(
     policy: PolicyPredictor,
@@ -201,7 +165,6 @@ def fit_lyapunov(
 
       env = gym.make("LinearCost-v0")
       lyapunov = fit_lyapunov(reference_controller(env), env, n_episodes=20, seed=0)
-      lyapunov.save("lyapunov.pt")
 
     Judge it on other episodes, with ``evaluate_lyapunov()`` and ``certify()``.
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_lac.stability.functions import LyapunovFunction
 from sb3_lac.stability.rollout import RollOuts, roll_out, take
-from sb3_lac.vec_env import GymnasiumVecEnv, env_specs
+from sb3_lac.vec_env import env_specs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -133,46 +133,15 @@ def closed_loop(
         raise ValueError(f"seed={seed!r} must be a whole number of at least 0, or None for a random one.")
     seed = int(seed)
     seeds = range(seed, seed + vec_env.num_envs)
-    if lyapunov is not None and lyapunov.seeds is not None:
-        check_seeds(seeds, lyapunov.seeds, "the Lyapunov function was fitted on")
+    fitted = None if lyapunov is None else lyapunov.seeds
+    if fitted is not None and seeds.start < fitted.stop and fitted.start < seeds.stop:
+        raise ValueError(
+            f"seed={seed} with {len(seeds)} environments starts episodes that the Lyapunov function was fitted on (seeds "
+            f"{fitted.start} to {fitted.stop - 1}): they say nothing about others. Use another seed, from {fitted.stop} on."
+        )
     units = nullcontext(0.0) if lyapunov is None else lyapunov.in_units_of(unwrap_vec_normalize(vec_env))
     with _undisturbed(policy, vec_env, seed), units as reward_bound:
         yield ClosedLoop(policy, vec_env, lyapunov, reward_bound, deterministic, seed)
-
-
-def check_seeds(seeds: range, of_others: Collection[int], others: str) -> None:
-    """Refuse episodes that something was made from: those of equal seeds begin alike, and say nothing of others."""
-    if not set(seeds).isdisjoint(of_others):
-        raise ValueError(
-            f"seed={seeds.start} with {len(seeds)} environments starts episodes that {others} (seeds {min(of_others)} to "
-            f"{max(of_others)}): they say nothing about others. Use another seed, from {max(of_others) + 1} on."
-        )
-
-
-def check_training_seeds(policy: PolicyPredictor, seeds: range) -> None:
-    """
-    Refuse episodes that begin as those of the training. Its seeds are those of its environments, whoever gave them: each
-    knows the seed of its ``np_random``. Environments that a model has no more, because it was loaded or got others, cannot be
-    asked. Of them only those are known that the model seeded itself: from its ``seed`` on, as many as it has now.
-    """
-    if not isinstance(policy, BaseAlgorithm):
-        return
-    trained = f"{type(policy).__name__} was trained on"
-    if policy.seed is not None:
-        check_seeds(seeds, range(policy.seed, policy.seed + policy.n_envs), trained)
-    env = policy.get_env()
-    if env is not None:
-        check_seeds(seeds, _seeds_of(env), trained)
-
-
-def _seeds_of(env: VecEnv) -> Collection[int]:
-    """The seeds of environments, none where they do not tell."""
-    if isinstance(env.unwrapped, GymnasiumVecEnv):
-        return env.unwrapped.last_seeds
-    # A vector environment of somebody else may have no attributes, and one that is closed fails as it likes
-    with suppress(Exception):
-        return env.get_attr("np_random_seed")
-    return ()
 
 
 def _evaluation_env(policy: PolicyPredictor, env: gym.Env | VecEnv, with_rewards: bool) -> VecEnv:

@@ -10,8 +10,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.collections import LineCollection
-from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
@@ -49,18 +47,16 @@ def set_log_scale(axes: Axes, which: Literal["x", "y"], values: pd.Series | np.n
         format_log_axis(axes.xaxis if which == "x" else axes.yaxis)
 
 
-def project(observations: np.ndarray | None, x: int, y: int, names: Sequence[str] | None) -> tuple[np.ndarray, dict[str, Any]]:
-    """Two dimensions of the observations, and the labels of their axes."""
-    if observations is None:
-        raise ValueError("This figure needs observations that are vectors (a Box space with at most one dimension).")
-    n_dims = observations.shape[1]
+def project(states: np.ndarray, x: int, y: int, names: Sequence[str] | None) -> tuple[np.ndarray, dict[str, Any]]:
+    """Two dimensions of states, and the labels of their axes."""
+    n_dims = states.shape[1]
     if not (0 <= x < n_dims and 0 <= y < n_dims):
-        raise ValueError(f"x={x} and y={y} must lie between 0 and {n_dims - 1}, the observations have {n_dims} dimensions.")
+        raise ValueError(f"x={x} and y={y} must lie between 0 and {n_dims - 1}, the states have {n_dims} dimensions.")
     if names is None:
-        names = [f"observation {k}" for k in range(n_dims)]
+        names = [f"state {k}" for k in range(n_dims)]
     if len(names) != n_dims:
-        raise ValueError(f"names={list(names)} must name all {n_dims} dimensions of the observations.")
-    return observations[:, [x, y]], {"xlabel": names[x], "ylabel": names[y]}
+        raise ValueError(f"names={list(names)} must name all {n_dims} dimensions of the states.")
+    return states[:, [x, y]], {"xlabel": names[x], "ylabel": names[y]}
 
 
 def draw_episodes(transitions: pd.DataFrame, axes: Axes) -> None:
@@ -189,7 +185,7 @@ def plot_certification(statements: pd.DataFrame, transitions: pd.DataFrame, ulti
 def plot_region_of_attraction(starts: pd.DataFrame, x: int, y: int, names: Sequence[str] | None) -> Figure:
     """See ``CertificationReport.plot_region_of_attraction()``."""
     states = starts[[column for column in starts if str(column).startswith("state_")]].to_numpy()
-    points, labels = project(states, x, y, names or [f"state {k}" for k in range(states.shape[1])])
+    points, labels = project(states, x, y, names)
     figure = new_figure(5.8, 4.8)
     axes = figure.subplots()
     # The worst of those that differ in other dimensions
@@ -205,39 +201,4 @@ def plot_region_of_attraction(starts: pd.DataFrame, x: int, y: int, names: Seque
         # Beside the axes: a grid of starts leaves no room in a corner
         figure.legend(fontsize=8, loc="outside lower center")
     axes.set(title=f"{len(points)} start states, {starts['n_episodes'].iloc[0]} episodes each", **labels)
-    return figure
-
-
-def plot_phase(
-    transitions: pd.DataFrame,
-    episodes: pd.DataFrame,
-    observations: np.ndarray | None,
-    x: int,
-    y: int,
-    names: Sequence[str] | None,
-) -> Figure:
-    """See ``LyapunovReport.plot_phase()``."""
-    points, labels = project(observations, x, y, names)
-    figure = new_figure(6.4, 5.2)
-    axes = figure.subplots()
-    lyapunov, episode = transitions["lyapunov"].to_numpy(), transitions["episode"].to_numpy()
-    inside = episode[1:] == episode[:-1]
-    lines = LineCollection(np.stack([points[:-1], points[1:]], axis=1)[inside], cmap="viridis_r", lw=0.9)
-    lines.set_array(lyapunov[:-1][inside])
-    # Also where no episode has a second step
-    lines.set_norm((LogNorm if is_wide(lyapunov) else Normalize)(lyapunov.min(), lyapunov.max()))
-    axes.add_collection(lines)
-    bar = figure.colorbar(lines, ax=axes, label="$L(s, a)$")
-    if is_wide(lyapunov):
-        format_log_axis(bar.ax.yaxis)
-    died = episodes["terminated"].to_numpy()
-    ends = points[np.append(~inside, True)]
-    for chosen, label, size, colour, marker in (
-        (~died, "survived", 16, "black", "o"),
-        (died, "died", 28, VERMILION, "x"),
-    ):
-        label = f"end, {label} ({np.sum(chosen)})"
-        axes.scatter(ends[chosen, 0], ends[chosen, 1], s=size, color=colour, marker=marker, label=label, zorder=3)
-    figure.legend(loc="outside lower center", ncols=2, fontsize=8)
-    axes.set(title=f"Trajectories of {len(episodes)} episodes", **labels)
     return figure

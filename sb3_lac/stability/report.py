@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -111,12 +110,6 @@ class LyapunovReport:
                 "time limit."
             )
         lines.append(f"With alpha3={self.alpha3:g} the decrease condition {self._verdict()}.")
-        if not self.lyapunov_over_cost.empty:
-            quantiles = ", ".join(f"{value:.3g}" for value in self.lyapunov_over_cost)
-            lines.append(f"L is {quantiles} times the cost (5th, 50th and 95th percentile of the transitions).")
-        if not math.isnan(self.alpha3_by_discount):
-            share = "no share" if self.alpha3_by_discount <= 0 else f"at most {self.alpha3_by_discount:.3g}"
-            lines.append(f"If L is exact, gamma={self.gamma:g} lets it decrease by {share} of the cost in 95 % of them.")
         if self.n_calibrated > 0:
             lines.append(f"L was compared with the cost-to-go of {self.n_calibrated} transitions.")
         return "\n".join(lines)
@@ -130,24 +123,6 @@ class LyapunovReport:
         if math.isnan(decrease.low):
             return "is undecided: too few episodes have a decrease for an interval, use more"
         return "is undecided: the interval of decrease contains 0"
-
-    @property
-    def lyapunov_over_cost(self) -> pd.Series:
-        """``L / c`` of the transitions with a cost, at its 5th, 50th and 95th percentile: how far ``L`` lies above it."""
-        with_cost = self.transitions[self.transitions["cost"] > 0]
-        ratios = with_cost["lyapunov"] / with_cost["cost"]
-        return ratios.quantile([0.05, 0.5, 0.95]) if len(ratios) > 0 else ratios
-
-    @property
-    def alpha3_by_discount(self) -> float:
-        """
-        The largest ``alpha3`` for which an exact ``L`` decreases in 95 % of the transitions with a cost: what follows from the
-        discount and from how slowly costs fade, ``(1 - (1 - gamma) * kappa) / gamma`` with ``kappa`` the 95th percentile of
-        ``L / c``. Not positive where no ``alpha3`` is feasible; NaN where ``L`` is no discounted sum.
-        """
-        if not 0 < self.gamma < 1 or self.lyapunov_over_cost.empty:
-            return math.nan
-        return float((1 - (1 - self.gamma) * self.lyapunov_over_cost.iloc[-1]) / self.gamma)
 
     @property
     def holds(self) -> bool:
@@ -214,19 +189,6 @@ class LyapunovReport:
 
         bound, alpha3 = self.metrics["cost_bound"].value, self.metrics["cost_bound_alpha3"].value
         return plots.plot_drift(self.by_cost, bound, alpha3, self.metrics["start_cost"].value)
-
-    def plot_phase(self, x: int = 0, y: int = 1, names: Sequence[str] | None = None) -> Figure:
-        """
-        Draw the trajectories in two dimensions of the observation, coloured by ``L``.
-
-        :param x: Dimension of the observation on the horizontal axis
-        :param y: Dimension of the observation on the vertical axis
-        :param names: Names of all dimensions
-        :return: The figure
-        """
-        from sb3_lac.stability import plots
-
-        return plots.plot_phase(self.transitions, self.episodes, self.observations, x, y, names)
 
 
 def evaluate_lyapunov(

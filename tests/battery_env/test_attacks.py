@@ -271,7 +271,7 @@ def counts(answers: pd.DataFrame) -> pd.DataFrame:
     return pd.crosstab([answers["calibrator"], answers["fault"]], answers["outcome"]).astype(int)
 
 
-@pytest.mark.slow
+@pytest.mark.attacks
 @settings(max_examples=40, deadline=None, derandomize=True, database=None)
 @given(fault=st.sampled_from([fault for fault in FAULTS if fault not in UNOBSERVABLE]), seed=st.integers(0, 10_000))
 def test_no_calibrator_is_sure_of_a_wrong_answer(fault, seed):
@@ -356,6 +356,7 @@ def swept_answers(case: Case, fault: str) -> list[tuple[object, ...]]:
     return answers
 
 
+@pytest.mark.attacks
 @pytest.mark.parametrize("fault", SWEEPS)
 @pytest.mark.parametrize("cell", ["simulated 3", "B0005 100", "B0006 72"])
 def test_no_fault_of_any_size_leaves_a_wrong_number_settled(cell, fault):
@@ -374,6 +375,7 @@ def test_no_fault_of_any_size_leaves_a_wrong_number_settled(cell, fault):
         assert {answer[4] for answer in sound if answer[0] == smallest} == {"right"}
 
 
+@pytest.mark.attacks
 @pytest.mark.parametrize("steady_s", [7, 45, 90])
 def test_a_load_that_is_switched_between_rows_leaves_no_wrong_number_settled(steady_s):
     """Rows meet such a load at the same places again and again: least squares once settled 4 to 15 % off."""
@@ -453,6 +455,7 @@ def test_the_full_state_needs_no_full_start():
         assert getattr(calibrator.estimate(record), name) == pytest.approx(true, rel=1e-6)
 
 
+@pytest.mark.attacks
 @pytest.mark.parametrize("recorded", [False, True])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_no_policy_is_sure_of_a_wrong_answer_and_each_answers_within_its_range(fault, recorded):
@@ -467,6 +470,7 @@ def test_no_policy_is_sure_of_a_wrong_answer_and_each_answers_within_its_range(f
                 assert low <= getattr(estimate, name) <= high
 
 
+@pytest.mark.attacks
 @pytest.mark.parametrize("cell", ["B0005", "B0006"])
 def test_no_policy_of_new_cells_is_sure_of_a_real_one(cell):
     """It has not learned of all that is wrong with the model of one."""
@@ -511,6 +515,7 @@ def fitted_wrongly(numbers: list[object], cut_off_V: float = 2.7) -> CellFit:
     return fit_cell(records, cut_off_V)
 
 
+@pytest.mark.attacks
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("fitted", FITTED)
 def test_nor_is_one_with_constants_that_were_fitted_to_the_wrong_discharges(fitted):
@@ -556,6 +561,7 @@ def test_the_closed_form_is_not_sure_of_what_its_state_contradicts(changes, sett
         assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15))
 
 
+@pytest.mark.attacks
 def test_attacks_are_counted_by_calibrator_and_fault():
     table = counts(attack(len(FAULTS), ("B0005",)))
     assert isinstance(table, pd.DataFrame) and table.to_numpy().sum() == 5 * len(FAULTS)

@@ -41,6 +41,7 @@ def estimator(policy=None, **options):
     return PolicyEstimator(policy or Step(), ENV_ID, **{**OPTIONS, **options})
 
 
+@pytest.mark.attacks
 @pytest.mark.parametrize(
     ("mismatch", "sensor"),
     [(0.0, SensorErrors(0.005)), (0.2, RandomSensorErrors((0.001, 0.030), 0.010))],

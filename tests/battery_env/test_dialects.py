@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 import pandas as pd
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -138,6 +139,7 @@ def write(f, folder):
     return path
 
 
+@pytest.mark.attacks
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.fixed_dictionaries({name: st.sampled_from(values) for name, values in FEATURES.items()}))
 def test_whatever_is_put_together_the_discharges_are_those_that_were_written(tmp_path, f):

@@ -249,7 +249,6 @@ BatteryVoltageRo-v0: {policy: MlpPolicy, n_timesteps: 96, n_envs: 16, learning_s
 """
 
 
-@pytest.mark.slow
 def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_path, capsys):
     for algo in ("lac", "sac"):
         (tmp_path / "zoo_configs" / f"{algo}.yml").write_text(VOLTAGE_CONFIG)

@@ -5,7 +5,6 @@ import itertools
 import math
 import random
 import warnings
-from copy import copy
 
 import gymnasium as gym
 import numpy as np
@@ -18,12 +17,12 @@ from scipy.optimize import linprog
 from scipy.stats import binom
 from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmarks.control import ScaledController
 from sb3_lac import CertificateCallback, GymnasiumVecEnv, LyapunovCallback, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import LinearCostEnv, reference_controller
-from sb3_lac.stability import CriticLyapunov, FittedLyapunov, LyapunovFunction, fitting
+from sb3_lac.stability import CriticLyapunov, LyapunovFunction, fitting
 from sb3_lac.stability.fitting import shortest_window, traced_returns
 from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, tightest_drift
 
@@ -94,43 +93,18 @@ def test_destabilised_loop_fails(linear_env, optimal, factor):
 
 
 def test_known_function_is_judged_like_a_learned_one(linear_env, optimal, exact):
-    env = LinearCostEnv()
-    function, p, average_cost = exact
+    function, _, average_cost = exact
     report = evaluate_lyapunov(optimal[0], linear_env, 100, seed=0, lyapunov=function)
     assert report.holds and report.alpha3 == 1.0
     # With it both bounds are the mean cost in the long run, of the noise alone: the drift is -(c - average cost)
     assert report.metrics["decrease"].value == pytest.approx(average_cost, rel=0.2)
     _, low, high = report.metrics["cost_bound"]
     assert low < 1.1 * average_cost < 1.5 * average_cost and average_cost < high
-    # L / c lies between the generalised eigenvalues of P and of the cost
-    gain = env.optimal_gain()
-    ratios = np.linalg.eigvals(np.linalg.solve(env.Q + gain.T @ env.R @ gain, p)).real
-    quantiles = report.lyapunov_over_cost
-    assert ratios.min() - 1e-3 <= quantiles.min() <= quantiles.max() <= ratios.max() + 1e-3
     # The bounds err on the safe side, with few episodes too
     for seed in (1000, 2000, 3000):
         metrics = evaluate_lyapunov(optimal[0], linear_env, 20, seed=seed, lyapunov=function).metrics
         assert metrics["residual"].high > average_cost and metrics["cost_bound"].high > average_cost
         assert metrics["cost_bound"].value < 1.5 * average_cost
-
-
-@pytest.mark.parametrize("gamma", [0.6, 0.95])
-def test_discount_and_ratio_tell_the_alpha3_of_an_exact_function(optimal, gamma):
-    env = LinearCostEnv()
-    p = env.value_matrix(env.optimal_gain(), gamma)
-    exact = LyapunovFunction(lambda states: np.einsum("ni,ij,nj->n", states, p, states), gamma=gamma)
-    judged = (optimal[0], make_vec_env("LinearCost-v0", 10, env_kwargs={"noise_std": 0.0}))
-    exact.alpha3 = alpha3 = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=exact).alpha3_by_discount
-    assert 0 < alpha3 < 1
-    # It decreases by that share of the cost in 95 % of the transitions (to which rounding of observations adds little)
-    report = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=exact)
-    with_cost = report.transitions[report.transitions["cost"] > 1e-6]
-    assert (with_cost["difference"] <= 1e-9).mean() == pytest.approx(0.95, abs=0.03)
-    assert f"If L is exact, gamma={gamma:g} lets it decrease by at most {alpha3:.3g} of the cost" in report.summary(full=True)
-    # Slower than the discount forgets: an L of forty times the cost
-    slow = LyapunovFunction(lambda states: 40 * (states**2).sum(axis=1), gamma=gamma)
-    report = evaluate_lyapunov(*judged, 10, seed=0, lyapunov=slow)
-    assert report.alpha3_by_discount < 0 and "decrease by no share of the cost" in report.summary(full=True)
 
 
 @pytest.mark.parametrize(("factor", "holds"), [(1.0, True), (-0.14, False)])
@@ -158,42 +132,6 @@ def test_roll_outs_of_a_fit_say_nothing_of_others(optimal, linear_env):
             with pytest.raises(ValueError, match=rf"seed={seed} with 10 environments .* \(seeds 0 to 9\).* from 10 on"):
                 judge(controller, linear_env, lyapunov=lyapunov, seed=seed)
     evaluate_lyapunov(controller, linear_env, 10, seed=10, lyapunov=lyapunov)
-
-
-# Whoever gave the seeds: the model, or who made the environments
-@pytest.mark.parametrize("of_the_model", [True, False])
-@pytest.mark.parametrize("kind", ["one by one", "in processes", "of Gymnasium", "in one call", "normalized"])
-def test_seeds_of_a_training_are_those_of_its_environments(kind, of_the_model, make_env):
-    same_step = {"autoreset_mode": "SameStep"}
-    make_envs = {
-        "one by one": lambda n: make_vec_env(make_env, n),
-        "in processes": lambda n: SubprocVecEnv([make_env] * n, start_method="fork"),
-        "of Gymnasium": lambda n: GymnasiumVecEnv(gym.vector.SyncVectorEnv([make_env] * n, **same_step)),
-        "in one call": lambda n: GymnasiumVecEnv(gym.make_vec("BatteryRo-v0", num_envs=n, **same_step)),
-        "normalized": lambda n: VecNormalize(make_vec_env(make_env, n)),
-    }[kind]
-    training_env, env = make_envs(4), make_envs(3)
-    if not of_the_model:
-        training_env.seed(5)
-    settings = {"learning_starts": 100, "buffer_size": 100, "policy_kwargs": {"net_arch": [8]}}
-    model = SAC("MlpPolicy", training_env, seed=5 if of_the_model else None, **settings).learn(8)
-    for seed in (3, 8):
-        with pytest.raises(ValueError, match=rf"seed={seed} with 3 environments .* SAC was trained on .seeds 5 to 8."):
-            certify(model, env, seed=seed)
-    certify(model, env, n_episodes=3, seed=9)
-    # Closed environments may be unable to tell
-    training_env.close()
-    certify(model, env, n_episodes=3, seed=9)
-    env.close()
-
-
-def test_environments_that_came_later_have_other_seeds_than_the_model(make_model, make_env):
-    model = make_model(make_env(), n_collect=0, seed=5)
-    model.set_env(make_vec_env(make_env, seed=50))
-    model.learn(10)
-    for seed in (5, 50):
-        with pytest.raises(ValueError, match=f"LAC was trained on .seeds {seed} to {seed}."):
-            certify(model, make_env(), n_episodes=1, seed=seed)
 
 
 def sampled(actions):
@@ -237,23 +175,6 @@ def test_fit_is_reproducible_and_leaves_random_numbers_alone(linear_env, optimal
         assert drawn == pytest.approx((0.7576315999, 0.417022004702574, 0.13436424411240122))
     np.testing.assert_array_equal(values[0], values[1])
     assert (values[0] != values[2]).any() and (values[0] >= 0).all()
-
-
-def test_function_is_saved_and_loaded(optimal, tmp_path):
-    lyapunov = copy(optimal[1])
-    # As a user may set them
-    lyapunov.alpha3, lyapunov.ultimate_bound = 0.5, np.float64(lyapunov.ultimate_bound)
-    path = tmp_path / "new" / "lyapunov.pt"
-    lyapunov.save(path)
-    assert [file.name for file in path.parent.iterdir()] == ["lyapunov.pt"]
-    loaded = FittedLyapunov.load(path)
-    points = np.random.default_rng(0).uniform(-1, 1, (20, 2))
-    np.testing.assert_array_equal(loaded.values(points), lyapunov.values(points))
-    np.testing.assert_array_equal([loaded.inputs.low, loaded.inputs.high], [lyapunov.inputs.low, lyapunov.inputs.high])
-    for name in ("average_cost", "level", "window_steps", "ultimate_bound", "reward_bound", "seeds", "alpha3", "gamma"):
-        assert getattr(loaded, name) == getattr(lyapunov, name), name
-    with pytest.raises(ValueError, match="have 3 numbers, the Lyapunov function takes 2"):
-        loaded.values(np.ones((1, 3)))
 
 
 def test_function_does_not_depend_on_what_never_changed(make_env):
@@ -637,7 +558,6 @@ def test_fit_that_diverges_is_refused(linear_env, optimal, monkeypatch):
     ("make", "arguments", "message"),
     [
         (CertificateCallback, {"seed": -1}, "seed=-1 must be a whole number of at least 0"),
-        (CertificateCallback, {"seed": 0}, "starts episodes that SAC was trained on"),
         (CertificateCallback, {"n_eval_episodes": -1}, "and not -1"),
         (CertificateCallback, {"ultimate_bound": "small"}, "ultimate_bound='small' must be a number"),
         (LyapunovCallback, {}, "must be a LAC or PublishedLAC.*CertificateCallback"),

@@ -238,7 +238,6 @@ def test_missing_compiler_is_noticed_before_the_first_step(make_model, monkeypat
     assert model.num_timesteps == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "device",
     [

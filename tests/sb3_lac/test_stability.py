@@ -326,8 +326,6 @@ def test_dict_observations_and_images(make_model, make, policy):
     report = evaluate_lyapunov(model, make(), 2)
     assert report.observations is None and report.transitions["lyapunov"].notna().all()
     assert len(report.transitions) >= 2 and len(report.plot().axes) == 4
-    with pytest.raises(ValueError, match="observations that are vectors"):
-        report.plot_phase()
     # Images are transposed as for the training
     callback = LyapunovCallback(make(), n_eval_episodes=1, eval_freq=4, verbose=0)
     model.learn(5, callback=callback)
@@ -399,14 +397,6 @@ def test_figures(make_exact_model):
     arguments = {"starts": starts, "lengths": (10, 12), "deaths": (False, False, True)}
     report = evaluate_lyapunov(make_exact_model(**arguments), ContractionEnv(**arguments), 30)
     assert len(report.plot().axes) == 4
-    # A panel and a colour bar
-    axes, _ = report.plot_phase(x=2, y=1, names=["position", "velocity", "angle"]).axes
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("angle", "velocity")
-    # Trajectories do not run from one episode to the next
-    assert len(axes.collections[0].get_segments()) == len(report.transitions) - 30
-    for wrong, message in (({"y": 3}, "must lie between 0 and 2"), ({"names": ["position"]}, "must name all 3 dimensions")):
-        with pytest.raises(ValueError, match=message):
-            report.plot_phase(**wrong)
 
 
 # Callback
