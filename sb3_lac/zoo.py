@@ -61,7 +61,7 @@ Hyperparams = dict[str, Any]
 def sample_lac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> Hyperparams:
     """Sampler for LAC hyperparams."""
     # n_envs, train_freq and gradient_steps stay those of the configuration: they belong together
-    sampled_params = {
+    sampled_params: Hyperparams = {
         # gamma from 0.5 to 0.9999
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.5, log=True),
         # From 2**5=32 to 2**10=1024
