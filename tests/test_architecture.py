@@ -102,7 +102,7 @@ def test_sb3_lac_knows_nothing_of_batteries(path):
         ("functions", {"costs"}),
         ("rollout", {"stability.functions"}),
         ("loop", {"stability.functions", "stability.rollout", "vec_env"}),
-        ("fitting", {"files", "stability.functions", "stability.loop", "stability.rollout"}),
+        ("fitting", {"stability.functions", "stability.loop", "stability.rollout"}),
     ],
 )
 def test_only_reports_know_the_other_files_of_stability(module, may_import):
