@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_load, check_numbers, check_positive, check_range
-from battery_env.records import SWITCH_SHARE, Record, drawn, resample_current
+from battery_env.records import Record, drawn, is_load, load_span, resample_current, switches
 
 _MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
 #: The blocks of :class:`BlockBootstrap`, as a share of the record.
@@ -325,13 +325,12 @@ def steadier_unit(record: Record) -> LoadUnit:
     voltage falls.
     """
     current_A = np.asarray(record.current_A)
-    switch_A = SWITCH_SHARE * np.abs(current_A).max()
-    parts = np.split(np.arange(len(current_A)), np.flatnonzero(np.abs(np.diff(current_A)) > switch_A) + 1)
+    parts, loaded = np.split(np.arange(len(current_A)), switches(current_A) + 1), is_load(current_A)
     drift = {"current": 0.0, "power": 0.0}
     for part in parts:
         # the first sample after a switch may show a part of it only
         third = (len(part) - 1) // 3
-        if third < 1 or current_A[part].min() <= switch_A:
+        if third < 1 or not loaded[part].all():
             continue
         for unit, load in (("current", current_A), ("power", current_A * np.asarray(record.voltage_V))):
             drift[unit] += float(np.log(load[part[-third:]].mean() / load[part[1 : 1 + third]].mean()) ** 2)
@@ -376,12 +375,10 @@ class BlockBootstrap(RandomLoad):
     @cached_property
     def _values(self) -> FloatArray:
         current_A = np.asarray(self.record.current_A)
-        loaded = np.flatnonzero(current_A > SWITCH_SHARE * np.abs(current_A).max())
-        if not len(loaded):
-            raise ValueError("no current flows in this record, which says nothing about its load. Give the load.")
         time_s = np.asarray(self.record.time_s)
+        span = load_span(time_s, current_A)
         load = current_A * np.asarray(self.record.voltage_V) if self.unit == "power" else current_A
-        first, last = (int((time_s[n] - time_s[0]) / self.dt_s + 1e-9) for n in (loaded[0], -1))
+        first, last = (int((time_s[n] - time_s[0]) / self.dt_s + 1e-9) for n in (span.first, -1))
         return check_load(resample_current(time_s, load, self.dt_s, last)[first:], self.unit)
 
     @cached_property

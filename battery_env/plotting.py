@@ -26,7 +26,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS, Q_MOBILE, R_O
-from battery_env.records import SWITCH_SHARE, Record
+from battery_env.records import Record, switches
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import VoltageForecast
 
@@ -296,9 +296,8 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
 
 def _stretches(record: Record) -> int:
     """How many stretches of time the points of a record are drawn by: fewer where each would show one pulse."""
-    current_A = np.abs(np.diff(record.current_A))
-    switches = int((current_A > SWITCH_SHARE * np.abs(record.current_A).max()).sum())
-    return _STRETCHES if switches <= _FEW_SWITCHES else min(_STRETCHES, switches // 4)
+    count = len(switches(record.current_A))
+    return _STRETCHES if count <= _FEW_SWITCHES else min(_STRETCHES, count // 4)
 
 
 def _drawn_points(x: FloatArray, y: FloatArray, stretches: int = _STRETCHES) -> tuple[FloatArray, FloatArray]:

@@ -33,7 +33,6 @@ from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized,
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records import (
     CUT_OFF_V,
-    SWITCH_SHARE,
     Record,
     check_drawn_charge,
     check_record,
@@ -113,10 +112,7 @@ def fit_cell(
     prior = _prior(records, start, thermal, cut_off_V)
     check_dt(dt_s, prior)
     # a simulated record is at rest before its first current acts
-    at_rest = [
-        not isinstance(whole, Discharge) or bool(whole.current_A[0] <= SWITCH_SHARE * whole.current_A.max())
-        for whole in discharges
-    ]
+    at_rest = [not isinstance(whole, Discharge) or whole.load.first > 0 for whole in discharges]
     _check_starts_alike(records, at_rest)
     fit = JointFit(records, at_rest, prior, thermal, dt_s).solve()
     if not fit.rmse_V <= limit_V:

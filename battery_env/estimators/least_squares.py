@@ -37,7 +37,7 @@ from battery_env.estimators.diagnosis.samples import note_samples, unseen_C, wat
 from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.search import Fit, JointPrior, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
-from battery_env.records import Record, Samples, Shown, check_record, drawn_charge_C, shown_beside
+from battery_env.records import ChargeHistory, Record, Samples, check_record, drawn_charge_C, history_of
 from battery_env.records.model import RecordModel
 
 # Residuals whose variance is this many of its standard deviations above the one expected are not noise.
@@ -208,7 +208,7 @@ class LeastSquares(Estimator):
         :return: the estimate
         :raises ValueError: if the record cannot be used, or the least ``q_mobile`` it allows is outside the bounds
         """
-        return self._estimate(self._samples(record), self._shown(record))
+        return self._estimate(self._samples(record), self._history(record))
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -232,18 +232,18 @@ class LeastSquares(Estimator):
         stops = np.unique(np.append(samples[samples >= fewest], len(time_s)))
         estimates: list[Estimate] = []
         for stop in stops:
-            estimates.append(self._estimate(whole.first(stop), self._shown(record), *estimates[-1:]))
+            estimates.append(self._estimate(whole.first(stop), self._history(record), *estimates[-1:]))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
     def _samples(self, record: Record) -> Samples:
         return check_record(record, least_samples=len(self.parameters) + 1)
 
-    def _shown(self, record: Record) -> Shown:
+    def _history(self, record: Record) -> ChargeHistory:
         # where another charge is stated, that before the load does not count
-        shown = shown_beside(record)
-        return shown if self.initial_soc[0] == 1.0 else shown._replace(charge=None)
+        history = history_of(record)
+        return history if self.initial_soc[0] == 1.0 else history._replace(charge=None)
 
-    def _estimate(self, record: Samples, shown: Shown, previous: Estimate | None = None) -> Estimate:
+    def _estimate(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> Estimate:
         search = Search.of(record, self.model, self.parameters, self.nuisance, self.bounds)
         if self.path is not None:
             starts = _starts_along(self.path, search)
@@ -252,13 +252,13 @@ class LeastSquares(Estimator):
         else:
             search = search.until_empty()
             starts = search.starts([self.model.cell.q_mobile])[0]
-        found = self._fitted(record, search, starts, shown)
+        found = self._fitted(record, search, starts, history)
         sd = found.sd(found.fit, dict.fromkeys(self.parameters, self._sd_ratio))
-        values, verdict = found.fit.values, self._verdict(record, shown, found)
+        values, verdict = found.fit.values, self._verdict(record, history, found)
         constants = None if self.path is None else {name: values[name] for name in self.nuisance}
         return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict(), constants=constants)
 
-    def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]], shown: Shown) -> _Fitted:
+    def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]], history: ChargeHistory) -> _Fitted:
         """The best fits with and without the prior, and what their standard deviations are made of."""
         n = len(search.data.time_s)
         noise_V = self.voltage_noise_V
@@ -286,15 +286,15 @@ class LeastSquares(Estimator):
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance_V2) / sd_C)
             fit = search.best([*starts, alone.values, *search.starts([mean_C])[0]], [*priors, carried])
-        seen = self._seen(record, shown, fit)
+        seen = self._seen(record, history, fit)
         return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit, unseen_C(seen)), seen)
 
-    def _seen(self, record: Samples, shown: Shown, fit: Fit) -> Any:
+    def _seen(self, record: Samples, history: ChargeHistory, fit: Fit) -> Any:
         """What the samples of a record show beside a fit, whose model may be empty before they end."""
         model_V = np.full(len(record.time_s), nan)
         model_V[: len(fit.residual_V)] = record.voltage_V[: len(fit.residual_V)] + fit.residual_V
         estimate = [fit.values[name] for name in PARAMETER_NAMES]
-        return watched(record, self.model.cell, self.initial_soc[0] if self._at_rest else None, estimate, shown, model_V)
+        return watched(record, self.model.cell, self.initial_soc[0] if self._at_rest else None, estimate, history, model_V)
 
     def _hidden_sd(self, search: Search, fit: Fit, unseen_C: float) -> dict[str, float]:
         """
@@ -324,14 +324,14 @@ class LeastSquares(Estimator):
             for n, name in enumerate(self.parameters)
         }
 
-    def _verdict(self, record: Samples, shown: Shown, found: _Fitted) -> Verdict:
+    def _verdict(self, record: Samples, history: ChargeHistory, found: _Fitted) -> Verdict:
         """What speaks against an estimate."""
         fit, alone, cell, diagnosis = found.fit, found.alone, self.model.cell, Diagnosis()
         n, free, q_mobile = len(fit.residual_V), self.parameters, fit.values["q_mobile"]
         own, moved_V2 = found.sd(alone, {"q_mobile": self._sd_ratio}), fit.square_V2 - alone.square_V2
         unknown = [name for name in free if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
         unsettled_sd_C = own["q_mobile"] if "q_mobile" in unknown else inf
-        note_samples(diagnosis, found.seen, self.initial_soc[0], record, shown, unsettled_sd_C)
+        note_samples(diagnosis, found.seen, self.initial_soc[0], record, history, unsettled_sd_C)
         diagnosis.note(Condition.EMPTY, n < len(record.time_s))
         if self.voltage_noise_V is None:
             noise_V, excess = white_noise_V(fit.residual_V), EXCESS_LIMIT_UNSTATED / sqrt(n)

@@ -32,7 +32,7 @@ from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.policies.estimator import PolicyEstimator
-from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, mean_current_A, shown_beside
+from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, history_of, mean_current_A
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
@@ -365,10 +365,10 @@ def _is_all_logged(seen: _Seen, forecast: VoltageForecast, estimate: Estimate) -
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
-    record, beside, parameters = Samples.of(seen.record), shown_beside(seen.record), (estimate.q_mobile, estimate.r_o)
-    shown = watched(record, seen.cell, seen.start.soc, parameters, beside, forecast.at_samples_V)
+    record, history, parameters = Samples.of(seen.record), history_of(seen.record), (estimate.q_mobile, estimate.r_o)
+    shown = watched(record, seen.cell, seen.start.soc, parameters, history, forecast.at_samples_V)
     # a charge that tapered off fills any cell, whatever its voltage at rest
-    is_lower = shown["start"]["first_V"] < shown["start_V"] and not (beside.charge and beside.charge.tapered)
+    is_lower = shown["start"]["first_V"] < shown["start_V"] and not (history.charge and history.charge.tapered)
     return not (fault_condition(shown) or (is_lower and start_condition(shown)) or doubtful_C(shown))
 
 

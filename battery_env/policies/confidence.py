@@ -25,7 +25,7 @@ from battery_env.estimators.diagnosis.conditions import (
 from battery_env.estimators.diagnosis.samples import note_samples, unseen_C, watched
 from battery_env.estimators.search import square
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.records import Samples, Shown
+from battery_env.records import ChargeHistory, Samples
 from battery_env.records.model import RecordModel
 from battery_env.tasks.voltage.fit import REACH_SD, Fitted
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES, VoltageTask
@@ -68,7 +68,7 @@ class Confidence:
         return RecordModel(cell, dt_s=self._dt_s).voltage(record, Estimate(q_mobile, r_o)) + fitted.offset_V[n]
 
     def verdict(
-        self, fitted: Fitted, n: int, estimate: FloatArray, record: Samples, shown: Shown
+        self, fitted: Fitted, n: int, estimate: FloatArray, record: Samples, history: ChargeHistory
     ) -> tuple[Verdict, FloatArray]:
         """
         Which numbers of an estimate are settled, and why not both; and its standard deviations, those of the fit with the
@@ -77,7 +77,7 @@ class Confidence:
         """
         diagnosis, cell, (q_mobile, r_o) = Diagnosis(), self._cell, estimate.tolist()
         model_V = self._model_V(fitted, n, record)
-        seen = watched(record, cell, 1.0, (q_mobile, r_o), shown, model_V)
+        seen = watched(record, cell, 1.0, (q_mobile, r_o), history, model_V)
         hidden = np.hypot([unseen_C(seen), 0.0], fitted.estimate[n] - estimate)
         sd = np.hypot(fitted.sd_alone[n] * [self._sd_ratio, 1.0], hidden)
         is_measured = np.isfinite(record.voltage_V)
@@ -88,7 +88,7 @@ class Confidence:
         mismatch_V = 0.0 if self._path is None else MISMATCH_MARGIN * self._path.mismatch_V
         is_above = first_V > full_V + self._offset_V + _NOISES * sqrt(white_V**2 + mismatch_V**2)
         diagnosis.note(Condition.START_ABOVE, is_above, **start_measured(first_V, full_V))
-        note_samples(diagnosis, seen, 1.0, record, shown, inf if sd[0] < SETTLED_SHARES["q_mobile"] * q_mobile else sd[0])
+        note_samples(diagnosis, seen, 1.0, record, history, inf if sd[0] < SETTLED_SHARES["q_mobile"] * q_mobile else sd[0])
         diagnosis.note(Condition.FEW, readings < len(self._parameters) + SPARE_SAMPLES, of="readings", or_else="")
         limit_V2 = (1.0 + EXCESS_LIMIT_UNSTATED / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
         limit_V2 += mismatch_V**2

@@ -23,7 +23,15 @@ from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, 
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
 from battery_env.policies.readings import columns, on_grid, with_voltage
-from battery_env.records import Samples, Shown, check_drawn_charge, check_record, check_sample, drawn_charge_C, shown_beside
+from battery_env.records import (
+    ChargeHistory,
+    Samples,
+    check_drawn_charge,
+    check_record,
+    check_sample,
+    drawn_charge_C,
+    history_of,
+)
 from battery_env.records.model import RecordModel
 from battery_env.tasks.env import CalibrationEnv, task_class
 from battery_env.tasks.task import CalibrationTask
@@ -157,7 +165,7 @@ class PolicyEstimator(OnlineEstimator):
         self._verdict = Verdict(False, False, Condition.NO_FIT.text) if self._confidence is None else _NOT_JUDGED
         if self._confidence is not None and self._fitted is not None:
             samples = with_voltage(self._samples, self._decisions * self.decision_s)
-            self._verdict, sd = self._confidence.verdict(self._fitted, 0, self._now, samples, Shown())
+            self._verdict, sd = self._confidence.verdict(self._fitted, 0, self._now, samples, ChargeHistory())
             self._found = self._confidence.constants(self._fitted, 0)
             # the same NaN always, so that equal estimates are equal
             self._sd = [nan if isnan(each) else each for each in sd.tolist()]
@@ -278,7 +286,7 @@ class PolicyEstimator(OnlineEstimator):
     def _traces(self, records: Sequence[Record], judge_last_only: bool = False) -> list[EstimateTrace]:
         """Those of :meth:`trace`; a verdict takes longer than a decision, and may be left to the last of each discharge."""
         task = self._follow(records, self.decision_s)
-        samples = [] if self._confidence is None else [(Samples.of(record), shown_beside(record)) for record in records]
+        samples = [] if self._confidence is None else [(Samples.of(record), history_of(record)) for record in records]
         made: list[FloatArray] = []
         verdicts: list[Verdict] = []
         found: list[dict[str, float] | None] = []
@@ -297,8 +305,8 @@ class PolicyEstimator(OnlineEstimator):
                         verdicts.append(_NOT_JUDGED)
                         found.append(None)
                         continue
-                    record, shown = samples[discharge[n]]
-                    verdict, sd[n] = self._confidence.verdict(fitted, n, estimate[n], record.first(int(known[n])), shown)
+                    record, history = samples[discharge[n]]
+                    verdict, sd[n] = self._confidence.verdict(fitted, n, estimate[n], record.first(int(known[n])), history)
                     verdicts.append(verdict)
                     found.append(self._confidence.constants(fitted, n))
             made.append(np.concatenate(columns, axis=1)[running])

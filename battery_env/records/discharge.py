@@ -10,7 +10,7 @@ from importlib.resources import as_file, files
 from math import hypot
 from numbers import Real
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -19,20 +19,19 @@ from scipy.io import loadmat
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive
 from battery_env.parameters import Q_MOBILE
-from battery_env.records.samples import (
-    MILLIAMPERE,
+from battery_env.records.history import ChargeHistory
+from battery_env.records.load import (
     REST_CURRENT_A,
     SWITCH_SHARE,
-    check_column,
-    check_drawn_charge,
-    check_samples,
+    LoadSpan,
     drawn,
-    drawn_charge_C,
-    least_load_A,
+    load_on_sd_C,
+    load_span,
+    rest_current_A,
     switch_times_s,
+    switched_sd_C,
 )
-from battery_env.records.shown import Shown, is_mixed, load_on_sd_C, rest_current_A
-from battery_env.records.switches import switched_sd_C
+from battery_env.records.samples import MILLIAMPERE, check_column, check_drawn_charge, check_samples, drawn_charge_C
 
 #: How to cite the bundled data.
 NASA_CITATION = (
@@ -56,8 +55,6 @@ CLOCKS = {
     "hours": ("h", 3600.0),
     "days": ("d", 86400.0),
 }
-# What draws no more than this share of the charge before or after the main load is noise, or an offset.
-_LITTLE_SHARE = 5e-3
 # No cell changes its voltage by this much from one sample to the next, and back, but for its load, V.
 _JUMP_V = 0.05
 # Where the load varies, more samples than these below the cut-off are no fault of the sensor.
@@ -79,7 +76,7 @@ class Discharge:
     :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
     :param starts_at_rest: whether the first voltage is that of the cell at rest, and the first current that of the load
         that is switched on then, as in a :meth:`loaded_part`. Calibrators judge by it whether the cell was full
-    :param shown: what else is known beside the samples: the charge before, which says whether the cell was full
+    :param history: what else is known of its charge: the charge before, which says whether the cell was full
     :raises ValueError: for arrays that do not fit together, or invalid values; it says what to do
     """
 
@@ -89,7 +86,7 @@ class Discharge:
     temperature_C: FloatArray | None = None
     meta: dict[str, Any] = field(default_factory=dict)
     starts_at_rest: bool = False
-    shown: Shown = field(default_factory=Shown)
+    history: ChargeHistory = field(default_factory=ChargeHistory)
     #: see :func:`battery_env.records.check_record`
     is_checked: ClassVar[bool] = True
 
@@ -121,7 +118,7 @@ class Discharge:
                 f"time_s must span {least_s:g} .. {most_s:g} s, got {duration_s:g} s, too "
                 f"{'short' if duration_s < least_s else 'long'} for a discharge.{advice}"
             )
-        check_drawn_charge(self.charge_C)
+        check_drawn_charge(drawn_charge_C(self))
         if self.charge_C > Q_MOBILE.limits[1]:
             raise ValueError(
                 f"this record draws {self.charge_C:.3g} C, more than the {Q_MOBILE.limits[1]:g} C that a cell may hold. "
@@ -142,15 +139,20 @@ class Discharge:
         """The same as if the temperature had not been measured."""
         return self._derived(temperature_C=None)
 
+    @cached_property
+    def load(self) -> LoadSpan:
+        """Where the load begins and ends."""
+        return load_span(self.time_s, self.current_A)
+
     @property
     def charge_C(self) -> float:
         """The charge drawn from the first sample to the last, C; a load comes on when the tester says, if it does."""
-        charge_C = drawn_charge_C(self)
-        if self.shown.load_on_s is not None and self._loaded[0] and self._is_load_on_told:
-            around = slice(self._loaded[0] - 1, self._loaded[0] + 1)
+        charge_C, told_s = drawn_charge_C(self), self._told_load_on_s
+        if told_s is not None and self.load.first:
+            around = slice(self.load.first - 1, self.load.first + 1)
             (begin_s, end_s), parts_A = self.time_s[around], self.current_A[around]
             charge_C -= float(np.diff(drawn(self.time_s, self.current_A, [begin_s, end_s]))[0])
-            charge_C += float(parts_A @ np.diff([begin_s, self.shown.load_on_s, end_s]))
+            charge_C += float(parts_A @ np.diff([begin_s, told_s, end_s]))
         return charge_C
 
     @property
@@ -159,12 +161,12 @@ class Discharge:
         Standard deviation of the charge drawn by all that no sample shows, C; what flows at rest may be an offset of the
         sensor.
         """
-        shown, (first, last) = self.shown, self._loaded
+        history, (first, last) = self.history, self.load
         # when the load came on may be told, and a count is that of the load alone
-        begin = first if self._is_load_on_told else max(first - 1, 0)
-        unknown = [slice(begin, first + 1), slice(last, last + 2)] if shown.is_counted else [slice(begin, None)]
+        begin = first if self._told_load_on_s is not None else max(first - 1, 0)
+        unknown = [slice(begin, first + 1), slice(last, last + 2)] if history.is_counted else [slice(begin, None)]
         switched_C = [switched_sd_C(self.time_s[rows], self.current_A[rows]) for rows in unknown]
-        return hypot(shown.load_on_C, shown.offset_A * float(np.ptp(self.time_s)), shown.uncounted_C, *switched_C)
+        return hypot(history.load_on_C, history.offset_A * float(np.ptp(self.time_s)), history.uncounted_C, *switched_C)
 
     @property
     def load_on_time_s(self) -> float:
@@ -173,42 +175,27 @@ class Discharge:
         one under load, as the switch falls between the two, but at most one interval of the samples under load before these. A
         rest is often logged more seldom than a load.
         """
-        first, _ = self._loaded
-        if self._is_load_on_told:
-            return cast(float, self.shown.load_on_s)
+        first, told_s = self.load.first, self._told_load_on_s
+        if told_s is not None:
+            return told_s
         if not first:
             return float(self.time_s[0])
         return float(switch_times_s(self.time_s, self.current_A, np.array([first - 1]))[0])
 
     @property
-    def _is_load_on_told(self) -> bool:
-        """Whether the tester says when the load was switched on, as the rows may: after the last one at rest."""
-        first, told_s = self._loaded[0], self.shown.load_on_s
-        return told_s is not None and (not first or self.time_s[first - 1] <= told_s) and told_s <= self.time_s[first]
-
-    @cached_property
-    def _loaded(self) -> tuple[int, int]:
-        """
-        The first sample under load and the last one. Small loads before the first or after the last large one belong to the
-        discharge if they draw more than ``_LITTLE_SHARE`` of its charge; all else there is noise, or an offset.
-        """
-        most_A = self.current_A.max()
-        loaded = np.flatnonzero(self.current_A > SWITCH_SHARE * most_A)
-        first, last = int(loaded[0]), int(loaded[-1])
-        small_A = np.where(self.current_A > least_load_A(np.maximum(self.current_A, 0.0)), self.current_A, 0.0)
-        drawn_C = drawn(self.time_s, small_A, self.time_s)
-        little_C, small = _LITTLE_SHARE * drawn_C[-1], np.flatnonzero(small_A)
-        if drawn_C[max(first - 1, 0)] > little_C:
-            first = int(small[0])
-        if drawn_C[-1] - drawn_C[min(last + 1, len(drawn_C) - 1)] > little_C:
-            last = int(small[-1])
-        return first, last
+    def _told_load_on_s(self) -> float | None:
+        """When the tester says that the load was switched on, if the rows may say so, too: after the last one at rest."""
+        told_s = self.history.load_on_s
+        if told_s is None:
+            return None
+        first = self.load.first
+        return told_s if (not first or self.time_s[first - 1] <= told_s) and told_s <= self.time_s[first] else None
 
     def _first_below(self, cut_off_V: float) -> int | None:
         """The first sample under load that is at the cut-off or below."""
         if not isinstance(cut_off_V, Real) or np.isnan(cut_off_V):
             raise ValueError(f"cut_off_V must be a voltage in V, got {cut_off_V!r}")
-        first, last = self._loaded
+        first, last = self.load
         below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V) + first
         # a sample later the voltage may be that of this load still
         for end in self._ends_of_loads(first, int(below[0]) - 2 if len(below) else last):
@@ -224,7 +211,7 @@ class Discharge:
 
     def _ends_of_loads(self, first: int, last: int) -> list[int]:
         """The last samples of loads, from one sample to another, after which only smaller ones follow in the discharge."""
-        current_A = np.append(self.current_A[first : self._loaded[1] + 1], 0.0)
+        current_A = np.append(self.current_A[first : self.load.last + 1], 0.0)
         largest_later_A = np.maximum.accumulate(current_A[:0:-1])[::-1]
         ends = np.flatnonzero(largest_later_A < (1.0 - SWITCH_SHARE) * current_A[:-1]) + first
         return [int(end) for end in ends if end <= last]
@@ -234,7 +221,7 @@ class Discharge:
         Whether the last sample of a load is as near to the cut-off as the one an interval before it is to that sample: a
         tester stops by a reading that it need not write. The row of the end itself may lie just behind a regular one.
         """
-        first, _ = self._loaded
+        first, _ = self.load
         interval_s = float(np.median(np.diff(self.time_s[first : last + 1]))) if last > first else 0.0
         before = max(int(np.searchsorted(self.time_s, self.time_s[last] - 0.5 * interval_s)) - 1, 0)
         is_steady = abs(self.current_A[last] - self.current_A[before]) <= SWITCH_SHARE * self.current_A.max()
@@ -277,7 +264,7 @@ class Discharge:
         n = self._first_below(cut_off_V)
         if n is None:
             return float("nan")
-        if n == self._loaded[0] or self.voltage_V[n] > cut_off_V:
+        if n == self.load.first or self.voltage_V[n] > cut_off_V:
             return float(self.time_s[n])
         share = (self.voltage_V[n - 1] - cut_off_V) / (self.voltage_V[n - 1] - self.voltage_V[n])
         return float(self.time_s[n - 1] + share * (self.time_s[n] - self.time_s[n - 1]))
@@ -292,7 +279,7 @@ class Discharge:
         :return: that part, on the same clock
         :raises ValueError: if it has too few samples, or the voltage is below the cut-off by a fault of the sensor
         """
-        first, last = self._loaded
+        first, last = self.load
         start_s, end_s = self.load_on_time_s, self.eod_time_s(cut_off_V)
         if np.isnan(end_s):
             end_s = float(self.time_s[last])
@@ -304,17 +291,21 @@ class Discharge:
             )
         names = ("voltage_V", "current_A") if self.temperature_C is None else ("voltage_V", "current_A", "temperature_C")
         columns = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in names}
-        resting = max(first - 1 - is_mixed(self.voltage_V, first), 0)
+        # the last row before a load may already have the voltage under load: then the one before it is the last at rest
+        is_mixed = first > 1 and bool(
+            abs(self.voltage_V[first - 1] - self.voltage_V[first]) < abs(self.voltage_V[first - 1] - self.voltage_V[first - 2])
+        )
+        resting = max(first - 1 - is_mixed, 0)
         columns["voltage_V"][0], columns["current_A"][0] = self.voltage_V[resting], self.current_A[first]
-        starts_at_rest, shown = self.starts_at_rest, self.shown
+        starts_at_rest, history = self.starts_at_rest, self.history
         if first:
             starts_at_rest = bool(abs(self.current_A[resting]) <= REST_CURRENT_A)
-            shown = shown._replace(rest_s=float(self.time_s[resting] - self.time_s[0]))
-            if not self._is_load_on_told:
-                shown = shown._replace(load_on_C=load_on_sd_C(self.time_s, self.current_A, first, start_s))
-        if (offset_A := rest_current_A(self.current_A)) is not None:
-            shown = shown._replace(offset_A=offset_A)
-        return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest, shown=shown)
+            history = history._replace(rest_s=float(self.time_s[resting] - self.time_s[0]))
+            if self._told_load_on_s is None:
+                history = history._replace(load_on_C=load_on_sd_C(self.time_s, self.current_A, first, start_s))
+        if (offset_A := rest_current_A(self.current_A, self.load)) is not None:
+            history = history._replace(offset_A=offset_A)
+        return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest, history=history)
 
     def averaged(self, dt_s: float) -> Discharge:
         """

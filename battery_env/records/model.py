@@ -29,7 +29,8 @@ from battery_env.electrochemistry.ends import LONGEST_S, Cells, ToCome, run_down
 from battery_env.electrochemistry.tangents import TANGENT_NAMES, PolynomialDerivatives, least_q_mobile, roll_out_with_tangents
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE, R_O
-from battery_env.records.samples import Record, check_record, expected_current, resample_current
+from battery_env.records.load import expected_current, resample_current
+from battery_env.records.samples import Record, check_record
 
 # The total of the four charges is q_mobile / 0.6 at all times.
 _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())

@@ -1,7 +1,4 @@
-"""
-A record: time, voltage and current as they were measured during one discharge. What is valid, how the current runs between
-the samples, and what to expect of it after the last one.
-"""
+"""A record: time, voltage and current as they were measured during one discharge. What is valid, and how it comes in live."""
 
 from __future__ import annotations
 
@@ -11,22 +8,16 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from battery_env.arrays import FloatArray, IntArray
+from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_LIMITS
+from battery_env.records.load import REST_CURRENT_A, drawn
 
-#: A change of the current between two samples by more than this share of its largest magnitude is a switch of the load,
-#: not a drift; the current is taken to jump between the two samples (:func:`switch_times_s`).
-SWITCH_SHARE = 0.1
-#: A load whose current spreads by more than this share (from the 5th to the 95th percentile) has varied.
-VARIED_SHARE = 0.05
 #: Least and greatest time between two samples of a stream, s. Seconds given in milliseconds or in hours are mostly beyond.
 SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
-#: A cell whose current is below this rests, A; then the next sample may come after as long as a week, s.
-REST_CURRENT_A, REST_LIMIT_S = 0.02, 604_800.0
+#: At rest the next sample may come after as long as a week, s.
+REST_LIMIT_S = 604_800.0
 #: Where discharges of recorded cells end if nothing else is said, V.
 CUT_OFF_V = 2.7
-#: Currents below this share of the largest are taken for noise or sensor offset.
-LEAST_LOAD_SHARE = 0.03
 
 _MILLIVOLT = "Give the voltage of one cell in V, not in mV (command line: --units voltage=mV), and not that of a pack."
 #: What a current that is out of range usually is.
@@ -195,56 +186,6 @@ def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
         )
 
 
-def least_load_A(current_A: FloatArray) -> float:
-    """
-    The least current that counts as a load. It is above ``REST_CURRENT_A`` and ``LEAST_LOAD_SHARE`` of the largest current,
-    and never above the size of a switch.
-    """
-    most_A = float(np.abs(current_A).max())
-    return min(max(REST_CURRENT_A, LEAST_LOAD_SHARE * most_A), SWITCH_SHARE * most_A)
-
-
-def switch_times_s(time_s: FloatArray, load: FloatArray, before: IntArray) -> FloatArray:
-    """
-    When a load was switched between two samples: midway. A rest is often logged more seldom than a load, so next to a rest
-    the switch is at most one interval of the samples under load away from these.
-    """
-    middle_s = 0.5 * (time_s[before] + time_s[before + 1])
-    size = np.abs(load)
-    # of the samples at the ends no further interval is known
-    interval_s = np.concatenate([[np.inf], np.diff(time_s), [np.inf]])
-    at_rest = np.minimum(size[before], size[before + 1]) <= SWITCH_SHARE * size.max()
-    nearest_s = np.where(
-        size[before + 1] > size[before],
-        np.maximum(middle_s, time_s[before + 1] - interval_s[before + 2]),
-        np.minimum(middle_s, time_s[before] + interval_s[before]),
-    )
-    return np.where(at_rest, nearest_s, middle_s)
-
-
-def _knots(time_s: FloatArray, load: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The load as a piecewise-linear function of time, whose jumps are two knots at one time."""
-    switches = np.flatnonzero(np.abs(np.diff(load)) > SWITCH_SHARE * np.abs(load).max())
-    place = np.repeat(switches + 1, 2)
-    sides = np.column_stack([load[switches], load[switches + 1]]).ravel()
-    return np.insert(time_s, place, np.repeat(switch_times_s(time_s, load, switches), 2)), np.insert(load, place, sides)
-
-
-def drawn(time_s: FloatArray, load: FloatArray, at_s: ArrayLike) -> FloatArray:
-    """
-    Charge of a current, or energy of a power, drawn since the first sample. The load is linear between samples,
-    except where it was switched (see ``SWITCH_SHARE``): there it jumps, as :func:`switch_times_s` has it. Beyond the last
-    sample it keeps its last value.
-    """
-    t, i = _knots(time_s, load)
-    width = np.diff(t)
-    total = np.concatenate([[0.0], np.cumsum(0.5 * (i[1:] + i[:-1]) * width)])
-    slope = np.append(np.divide(np.diff(i), width, out=np.zeros_like(width), where=width > 0.0), 0.0)
-    n = np.searchsorted(t, at_s, side="right") - 1
-    since = np.asarray(at_s) - t[n]
-    return total[n] + since * (i[n] + 0.5 * slope[n] * since)
-
-
 def drawn_charge_C(record: Record) -> float:
     """The charge drawn from the first sample to the last."""
     return float(drawn(record.time_s, record.current_A, record.time_s[-1]))
@@ -253,18 +194,6 @@ def drawn_charge_C(record: Record) -> float:
 def mean_current_A(record: Record) -> float:
     """The charge drawn over the time from the first sample to the last."""
     return drawn_charge_C(record) / float(np.ptp(record.time_s))
-
-
-def resample_current(time_s: FloatArray, current_A: FloatArray, dt_s: float, n_steps: int) -> FloatArray:
-    """
-    The current on the model's time grid, which starts at the first sample: its mean over each step, so that the charge
-    drawn is kept exactly. A record whose samples lie ``dt_s`` apart, as simulated ones do, is taken as it is: there
-    ``current_A[k]`` is the current over the step that starts at sample k.
-    """
-    if np.allclose(np.diff(time_s), dt_s, rtol=1e-6, atol=0.0):
-        return current_A[np.minimum(np.arange(n_steps), len(current_A) - 1)]
-    grid_s = time_s[0] + dt_s * np.arange(n_steps + 1)
-    return np.diff(drawn(time_s, current_A, grid_s)) / dt_s
 
 
 class Stream(NamedTuple):
@@ -303,30 +232,3 @@ class Stream(NamedTuple):
     def samples(self) -> zip[tuple[float, float, float]]:
         """What :meth:`battery_env.estimators.OnlineEstimator.update` takes, sample by sample."""
         return zip(self.voltage_V.tolist(), self.current_A.tolist(), self.dt_s.tolist(), strict=True)
-
-
-class ExpectedCurrent(NamedTuple):
-    """The current to expect after the end of a record, A."""
-
-    mean_A: float  # 0 if the load was switched off and not on again
-    varied: bool  # whether the load did, so that the mean is that of its last half, and an assumption
-    sd_A: float  # how far means over quarters of the record lie from each other
-
-
-def expected_current(time_s: ArrayLike, current_A: ArrayLike) -> ExpectedCurrent:
-    """
-    The current to expect after the end of a record: the last one of a constant load, and the mean over the last half of a load
-    that varied by more than ``VARIED_SHARE``, pulses among them.
-    """
-    time, current = np.asarray(time_s, dtype=np.float64), np.asarray(current_A, dtype=np.float64)
-    loaded = current > SWITCH_SHARE * np.abs(current).max()
-    switches = np.flatnonzero(np.diff(loaded.astype(np.int64)) > 0)
-    if not loaded.any() or not (loaded[-1] or len(switches) + loaded[0] > 1):
-        return ExpectedCurrent(0.0, False, 0.0)
-    first = int(np.flatnonzero(loaded)[0])
-    low, high = np.quantile(current[first:], [0.05, 0.95])
-    if first == len(time) - 1 or high - low <= VARIED_SHARE * high:
-        return ExpectedCurrent(float(current[-1]), False, 0.0)
-    ends_s = np.linspace(time[first], time[-1], 5)
-    quarters_A = np.diff(drawn(time, current, ends_s)) / np.diff(ends_s)
-    return ExpectedCurrent(max(float(quarters_A[2:].mean()), 0.0), True, float(quarters_A.std(ddof=1)))

@@ -144,7 +144,7 @@ def test_a_power_or_a_charge_a_row_tells_the_current(unit, factor):
     table = TABLE.assign(**{"dq/mA.h": steps_C / 3.6}).drop(columns="current")
     found = read(table, "the current is the charge dq/mA.h over the time since the row before")
     np.testing.assert_allclose(found.current_A[1:], RECORD.current_A[1:])
-    assert found.shown.uncounted_C == 0.0
+    assert found.history.uncounted_C == 0.0
     # which is no matter of the voltage
     same(read(table.assign(Power=0.0).rename(columns={"Power": "P/W"}), "the current is the charge"), atol=2.0)
     # nobody needs them beside a current
@@ -324,7 +324,7 @@ def test_a_few_values_that_are_missing_cost_what_they_are_worth(missing, rows):
     discharge = read(table, f"left out, as the {missing} is missing: row {rows[0] + 1}")
     near(discharge)
     lost_C = 2.0 * 0.5 * (RECORD.time_s[102] - RECORD.time_s[99] + 9.4) if missing == "current" else 0.0
-    assert discharge.shown.uncounted_C == pytest.approx(lost_C / 3.0**0.5, rel=0.1, abs=0.5)
+    assert discharge.history.uncounted_C == pytest.approx(lost_C / 3.0**0.5, rel=0.1, abs=0.5)
     table.loc[np.arange(90, 130), missing] = np.nan
     with pytest.raises(ValueError, match=f"the {missing} must be finite, got nan in row "):
         read_discharges(table)
@@ -355,11 +355,11 @@ def test_the_time_in_a_step_tells_when_the_load_was_switched_on(gap_s, share, of
     told_C = before_s * found.current_A[LOAD_ON]
     usual_C = (RECORD.time_s[LOAD_ON] - RECORD.load_on_time_s) * found.current_A[LOAD_ON]
     assert part.charge_C == pytest.approx(RECORD.loaded_part(2.7).charge_C + told_C - usual_C, abs=0.1)
-    assert part.shown.load_on_C == 0.0
+    assert part.history.load_on_C == 0.0
     assert found.charge_C - part.charge_C == pytest.approx(RECORD.charge_C - RECORD.loaded_part(2.7).charge_C, abs=0.6)
     # a step that began elsewhere, or does not count, tells nothing
     for other in (after + 500.0, 0.0 * after):
-        assert read(table.assign(**{"Step Time (s)": other})).shown.load_on_s is None
+        assert read(table.assign(**{"Step Time (s)": other})).history.load_on_s is None
 
 
 @pytest.mark.parametrize("missing", [0, 3, 30])
@@ -377,7 +377,7 @@ def test_the_count_of_the_tester_tells_when_the_load_was_switched_on(missing, st
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             (other,) = read_discharges(table.assign(**{"Capacity (Ah)": other}))
-        assert other.shown.load_on_s is None and other.unseen_C > 5.0
+        assert other.history.load_on_s is None and other.unseen_C > 5.0
 
 
 def test_a_row_of_the_step_before_its_load_changes_nothing():
@@ -631,15 +631,15 @@ class TestCountedByTheTester:
             counted + 3.0,
             np.where(np.arange(len(counted)) > 100, counted - counted[100], counted),
         ):
-            shown = read(TABLE.assign(**{name: values})).shown
+            shown = read(TABLE.assign(**{name: values})).history
             assert shown.uncounted_C < 0.1 and shown.is_counted == (values[-1] != (counted - counted[100])[-1])
         # nor a name that is a unit, nor a count without a sign of what comes back
-        assert read(TABLE.assign(**{"Amp-hr": self.COUNTED})).shown.uncounted_C < 0.1
+        assert read(TABLE.assign(**{"Amp-hr": self.COUNTED})).history.uncounted_C < 0.1
         current_A = TABLE["current"].where(TABLE.index != 200, 1.0)
         passed = np.append(0.0, np.cumsum(np.abs(current_A.to_numpy()[:-1]) * np.diff(TABLE["time"]))) / 3600.0
-        assert read(TABLE.assign(current=current_A, **{"Capacity(Ah)": passed})).shown.uncounted_C < 20.0
+        assert read(TABLE.assign(current=current_A, **{"Capacity(Ah)": passed})).history.uncounted_C < 20.0
         # nor a column that is no count
-        assert not read(TABLE.assign(**{name: 2.0})).shown.is_counted
+        assert not read(TABLE.assign(**{name: 2.0})).history.is_counted
 
     def test_what_starts_anew_while_the_load_is_switched_tells_nothing_of_that(self):
         """Pulses of 10 s, each in one row alone, that a counter of single steps shows at 0."""
@@ -649,7 +649,7 @@ class TestCountedByTheTester:
         table["Voltage (V)"] = 4.1 - 2e-4 * time_s + 0.1 * table["Current (A)"]
         table["Capacity (mAh)"] = np.where(load, 2.0 * (time_s % 600.0) / 3.6, 0.0)
         found = read(table)
-        assert found.shown.uncounted_C < 0.01 * found.charge_C < found.unseen_C and not found.shown.is_counted
+        assert found.history.uncounted_C < 0.01 * found.charge_C < found.unseen_C and not found.history.is_counted
 
     def test_a_clock_beside_it_that_counts_the_same_tells_nothing(self):
         same(read(TABLE.rename(columns={"time": "Test_Time"}).assign(DateTime=1547507301.8 + TABLE["time"])))
@@ -657,15 +657,15 @@ class TestCountedByTheTester:
     @pytest.mark.parametrize("gain", [0.5, 0.9, 0.97, 1.03, 1.1, 2.0])
     def test_what_does_not_is_said_and_is_a_doubt_of_its_size(self, gain):
         for name, ticks in (("Amp-hr", 1.0), ("Capacity(mAs)", 3.6e6)):
-            assert read(TABLE.assign(**{name: ticks * gain * self.COUNTED}), "the tester counted").shown.uncounted_C > 0.0
+            assert read(TABLE.assign(**{name: ticks * gain * self.COUNTED}), "the tester counted").history.uncounted_C > 0.0
         discharge = read(TABLE.assign(**{"Capacity(Ah)": gain * self.COUNTED}), "the tester counted")
         charge_C = 3600.0 * self.COUNTED[-1]
-        assert discharge.shown.uncounted_C == pytest.approx(abs(gain - 1.0) * charge_C, rel=0.1)
+        assert discharge.history.uncounted_C == pytest.approx(abs(gain - 1.0) * charge_C, rel=0.1)
         for method in ("least-squares", "kalman"):
             found = calibrate(discharge, method=method)
-            assert found.sd_q_mobile_C > discharge.shown.uncounted_C and not found.settled_q_mobile
+            assert found.sd_q_mobile_C > discharge.history.uncounted_C and not found.settled_q_mobile
             assert "The tester counted another charge" in found.reason
-            assert found.sd_predicted_capacity_Ah > discharge.shown.uncounted_C / 3600.0
+            assert found.sd_predicted_capacity_Ah > discharge.history.uncounted_C / 3600.0
 
     @pytest.mark.parametrize(
         ("ticks", "said"), [(1.0, ""), (1e3, "milliseconds"), (1 / 60, "minutes"), (1 / 3600, "hours"), (1 / 86400, "days")]
@@ -692,9 +692,9 @@ def test_what_a_clock_that_starts_anew_with_each_step_loses_is_in_doubt(every_s,
         warnings.simplefilter("always")
         (found,) = read_discharges(pd.DataFrame(table), discharge_is_negative=False)
     true_C = float(current_A[:-1] @ np.diff(true_s))
-    assert abs(found.charge_C - true_C) <= 2.0 * found.shown.uncounted_C + 0.012 * true_C  # rows lie a second apart at best
-    assert (found.shown.uncounted_C == 0.0) == (writes_ends and 96 % every_s > 0)
-    assert any("is unknown" in str(each.message) for each in caught) == (found.shown.uncounted_C > 0.0)
+    assert abs(found.charge_C - true_C) <= 2.0 * found.history.uncounted_C + 0.012 * true_C  # rows lie a second apart at best
+    assert (found.history.uncounted_C == 0.0) == (writes_ends and 96 % every_s > 0)
+    assert any("is unknown" in str(each.message) for each in caught) == (found.history.uncounted_C > 0.0)
 
 
 @pytest.mark.parametrize("block", [slice(5, 25), slice(60, 100), slice(0, None)])

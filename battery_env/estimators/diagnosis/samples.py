@@ -29,8 +29,8 @@ from battery_env.estimators.diagnosis.conditions import (
 )
 from battery_env.estimators.diagnosis.rest import LEAST_REST_S
 from battery_env.estimators.diagnosis.rows import KEPT, STEADY_S, Row, find, middle, noise_V, table
-from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, ChargeBefore, Samples, Shown
-from battery_env.records.switches import SWITCHES, note_switch, switched_C
+from battery_env.records import LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE, ChargeBefore, ChargeHistory, Samples
+from battery_env.records.load import SWITCHES, note_switch, switched_C
 
 # A cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s. So does one whose
 # load is switched.
@@ -130,7 +130,7 @@ def watched(
     cell: CellParameters,
     initial_soc: float | None,
     estimate: Sequence[float],
-    shown: Shown,
+    history: ChargeHistory,
     model_V: FloatArray | None = None,
 ) -> Any:
     """
@@ -139,20 +139,20 @@ def watched(
     """
     seen = np.zeros(1, SEEN)
     expect(seen, cell, initial_soc)
-    take_in(seen, shown)
+    take_in(seen, history)
     columns = (np.ascontiguousarray(column) for column in record)
     _watch_all(seen, *columns, np.empty(0) if model_V is None else model_V, *estimate, cell.q_mobile)
     return seen[0]
 
 
 def note_samples(
-    diagnosis: Diagnosis, seen: Any, initial_soc: float, record: Samples, shown: Shown, unsettled_sd_C: float = inf
+    diagnosis: Diagnosis, seen: Any, initial_soc: float, record: Samples, history: ChargeHistory, unsettled_sd_C: float = inf
 ) -> None:
     """
     Note what the start of a record and its sensors, as :func:`watched` saw them, say against an estimate; of a ``q_mobile``
     that is not settled with its standard deviation, C.
     """
-    said = measured(seen, initial_soc, float(record.time_s[0]), shown.charge)
+    said = measured(seen, initial_soc, float(record.time_s[0]), history.charge)
     smeared = is_smeared(seen) * Condition.R_SWITCHES
     for number in (start_condition(seen), fault_condition(seen), doubt_condition(seen, unsettled_sd_C), smeared):
         if number:
@@ -166,17 +166,17 @@ def expect(seen: Any, cell: CellParameters, initial_soc: float | None) -> None:
         seen["start_V"], seen["low_V"] = rest_voltage_V(cell, initial_soc), low_rest_voltage_V(cell, initial_soc)
 
 
-def take_in(seen: Any, shown: Shown) -> None:
+def take_in(seen: Any, history: ChargeHistory) -> None:
     """Take in what is known beside the samples, before the first of them."""
-    start, rest, charge, full_V = seen["start"], seen["rest"], shown.charge, seen["start_V"]
-    start["at_rest"], seen["is_counted"], seen["uncounted_C"] = shown.at_rest, shown.is_counted, shown.uncounted_C
+    start, rest, charge, full_V = seen["start"], seen["rest"], history.charge, seen["start_V"]
+    start["at_rest"], seen["is_counted"], seen["uncounted_C"] = history.at_rest, history.is_counted, history.uncounted_C
     if charge is not None:
         # without a rest a charge that did not taper off tells nothing but that the cell is lower
-        is_low = (charge.highest_V < seen["low_V"]) | (not charge.tapered and shown.rest_s < LEAST_REST_S)
+        is_low = (charge.highest_V < seen["low_V"]) | (not charge.tapered and history.rest_s < LEAST_REST_S)
         start["charge"] = np.where(np.isnan(full_V), 0, np.where(is_low, -1, int(charge.tapered)))
         seen["left_C"], start["is_cut_short"] = np.where(np.isnan(full_V), 0.0, charge.left_C), not charge.tapered
-    if shown.load_on_C or shown.offset_A:
-        rest["is_over"], rest["mean_A"], rest["load_on_C"] = True, shown.offset_A, shown.load_on_C
+    if history.load_on_C or history.offset_A:
+        rest["is_over"], rest["mean_A"], rest["load_on_C"] = True, history.offset_A, history.load_on_C
 
 
 def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
@@ -273,7 +273,7 @@ def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> N
         rest.on_s = 0.0
     elif rest.samples > 0 and abs(current - rest.mean_A) > SWITCH_SHARE * max(abs(current), abs(rest.mean_A), REST_CURRENT_A):
         rest.is_over, rest.over_s = True, time_s
-        if abs(rest.mean_A) <= SWITCH_SHARE * abs(current):
+        if abs(rest.mean_A) <= LOAD_SHARE * abs(current):
             rest.on_s, rest.load_on_C = interval_s, interval_s * abs(current - rest.mean_A) / sqrt(3.0)
         else:
             rest.mean_A = 0.0  # it was a load
@@ -354,7 +354,7 @@ def start_condition(seen: Row) -> int:
         return Condition.START_CHARGED + 0
     if start.charge > 0 or not start.first_V < seen.low_V:
         return 0
-    return Condition.START_BELOW + 0 if start.first_A <= SWITCH_SHARE * start.most_A else Condition.START_LOADED + 0
+    return Condition.START_BELOW + 0 if start.first_A <= LOAD_SHARE * start.most_A else Condition.START_LOADED + 0
 
 
 @compiled

@@ -24,7 +24,7 @@ from battery_env.estimators.estimator import ModelNow, OnlineEstimator, check_bo
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
 from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
-from battery_env.records import ChargeBefore, Record, Stream, check_drawn_charge, check_sample, shown_beside
+from battery_env.records import ChargeBefore, Record, Stream, check_drawn_charge, check_sample, history_of
 
 #: How far cells of one nominal capacity may lie from it, new and worn: the standard deviation, as a share.
 PRIOR_SD_SHARE_Q = 0.25
@@ -254,13 +254,13 @@ class ExtendedKalmanFilter(OnlineEstimator):
         samples["temperature_K"] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
         if temperature_C is not None:
             self._begin(float(samples["temperature_K"][0]))
-        beside = shown_beside(record)
+        history = history_of(record)
         if self.initial_soc[0] < 1.0:
-            beside = beside._replace(charge=None)
-        take_in(self._cell["seen"], beside)
+            history = history._replace(charge=None)
+        take_in(self._cell["seen"], history)
         check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
         said = self._follow(samples)
-        shown = self._measured(self._cell["seen"], float(time_s[0]), beside.charge)
+        shown = self._measured(self._cell["seen"], float(time_s[0]), history.charge)
         noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
         texts = {each: _verdict(*each, shown).reason for each in set(noted)}
         sd_q, sd_r_o = said["sd"].T.copy()

@@ -20,7 +20,7 @@ from battery_env.arrays import FloatArray
 from battery_env.lab.readers.columns import Column, FileFormat, unit_of
 from battery_env.lab.readers.rows import cells_of, mended
 from battery_env.lab.readers.tables import columns_of, read_columns
-from battery_env.records import LEAST_LOAD_SHARE, SWITCH_SHARE, ChargeBefore, Shown, drawn
+from battery_env.records import LEAST_LOAD_SHARE, SWITCH_SHARE, ChargeBefore, ChargeHistory, drawn
 from battery_env.records.discharge import LEAST_SAMPLES, Discharge, read_nasa_mat
 
 Made = TypeVar("Made")
@@ -221,10 +221,12 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> 
         raise ValueError("there is no discharge: what is drawn are pulses within charges. Check the sign of the current")
     if pulses := sum(least_C <= drawn_C < each_C for (_, drawn_C), each_C in zip(parts, pulses_C, strict=True)):
         warnings.warn(f"pulses within charges, which are no discharges, are left aside: {pulses}", stacklevel=2)
-    before = [Shown(charge=_charge_before(rows, each.start), load_on_s=_load_on_s(rows, each)) for each in stretches]
+    before = [ChargeHistory(charge=_charge_before(rows, each.start), load_on_s=_load_on_s(rows, each)) for each in stretches]
     return [
-        _recording(rows[stretch], shown, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated)
-        for number, (stretch, shown) in enumerate(zip(stretches, before, strict=True), start=1)
+        _recording(
+            rows[stretch], history, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated
+        )
+        for number, (stretch, history) in enumerate(zip(stretches, before, strict=True), start=1)
     ]
 
 
@@ -326,11 +328,11 @@ def _load_on_s(rows: pd.DataFrame, stretch: slice) -> float | None:
 
 
 def _recording(
-    rows: pd.DataFrame, shown: Shown, meta: dict[str, Any], has_own_clock: bool, stated: frozenset[str]
+    rows: pd.DataFrame, history: ChargeHistory, meta: dict[str, Any], has_own_clock: bool, stated: frozenset[str]
 ) -> Recording:
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
-    if has_own_clock and shown.load_on_s is not None:
-        shown = shown._replace(load_on_s=shown.load_on_s - float(time_s[0]))
+    if has_own_clock and history.load_on_s is not None:
+        history = history._replace(load_on_s=history.load_on_s - float(time_s[0]))
     if "cycle" in rows:
         meta["cycle"] = int(rows["cycle"].iloc[int(np.argmax(current_A > SWITCH_SHARE * current_A.max()))])
     if "ambient" in rows and not rows["ambient"].isna().all():
@@ -344,25 +346,25 @@ def _recording(
         temperature_C = _filled(time_s, rows["temperature"].to_numpy())
         if temperature_C is not None:
             arrays["temperature_C"] = temperature_C
-    arrays["shown"] = _with_count(shown, rows)
+    arrays["history"] = _with_count(history, rows)
     return Recording(arrays, meta, stated)
 
 
-def _with_count(shown: Shown, rows: pd.DataFrame) -> Shown:
+def _with_count(history: ChargeHistory, rows: pd.DataFrame) -> ChargeHistory:
     """With how much the charge under load is another one than the tester counted row by row, or than a clock lost."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
     if not len(loaded):  # of values that no cell has, which are refused later
-        return shown
+        return history
     part = slice(loaded[0], loaded[-1] + 1)
     if "lost" in rows:  # all of it in each step of the program, none, or any part in all alike
-        shown = shown._replace(uncounted_C=float(rows["lost"].to_numpy()[part][1:].sum()) / 3.0**0.5)
+        history = history._replace(uncounted_C=float(rows["lost"].to_numpy()[part][1:].sum()) / 3.0**0.5)
     if "capacity" not in rows or len(loaded) < LEAST_SAMPLES:
-        return shown
+        return history
     step_C = np.diff(rows["capacity"].to_numpy()[part])
     step_C = step_C if (step_C > 0.0).sum() > (step_C < 0.0).sum() else -step_C  # a counter may count down
     if (step_C > 0.0).mean() < 0.5:
-        return shown
+        return history
     goes_on = step_C >= 0.0
     is_counted = bool(goes_on.all())
     if not is_counted:  # but anew with each step, of which the last row may be missing
@@ -377,7 +379,7 @@ def _with_count(shown: Shown, rows: pd.DataFrame) -> Shown:
             "Ah: check units and clock, and that all rows are there",
             stacklevel=2,
         )
-    return shown._replace(is_counted=is_counted, uncounted_C=abs(off_C))
+    return history._replace(is_counted=is_counted, uncounted_C=abs(off_C))
 
 
 def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int, bool, bool]]:

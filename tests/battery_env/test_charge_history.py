@@ -11,8 +11,8 @@ from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators.diagnosis.gaps import doubtful_C
 from battery_env.estimators.diagnosis.samples import fault_condition, unseen_C, watched
 from battery_env.estimators.estimator import OnlineEstimator
-from battery_env.records import ChargeBefore, Samples, Shown, Stream
-from battery_env.records.switches import switched_sd_C
+from battery_env.records import ChargeBefore, ChargeHistory, Samples, Stream
+from battery_env.records.load import switched_sd_C
 
 METHODS = ("least-squares", "kalman")
 TRUE_Q_C, TRUE_R_OHM, LOAD_A = 7000.0, 0.12, 2.0
@@ -43,8 +43,8 @@ class TestLoadOn:
     def test_its_doubt_covers_what_it_costs_however_far_apart_the_rows_are(self, every_s, method):
         for share in (0.02, 0.5, 0.98):
             found = calibrate(discharged(every_s, 3.0 * every_s, share * every_s), method=method)
-            assert found.record.shown.load_on_C == pytest.approx(LOAD_A * every_s / 12.0**0.5, rel=0.05)
-            assert found.sd_q_mobile_C > found.record.shown.load_on_C
+            assert found.record.history.load_on_C == pytest.approx(LOAD_A * every_s / 12.0**0.5, rel=0.05)
+            assert found.sd_q_mobile_C > found.record.history.load_on_C
             assert abs(found.q_mobile_C - TRUE_Q_C) < 2.5 * found.sd_q_mobile_C
             assert found.settled_q_mobile or every_s > 10.0, found.reason
             assert not found.settled_q_mobile or every_s < 200.0
@@ -56,7 +56,7 @@ class TestLoadOn:
         record = Discharge(whole.time_s[kept], whole.voltage_V[kept], whole.current_A[kept])
         found = calibrate(record)
         assert found.settled_q_mobile == (lost_s < 200.0) and is_right(found)
-        assert abs(found.drawn_Ah - whole.charge_C / 3600.0) * 3600.0 < 2.5 * found.record.shown.load_on_C + LOAD_A * 10.0
+        assert abs(found.drawn_Ah - whole.charge_C / 3600.0) * 3600.0 < 2.5 * found.record.history.load_on_C + LOAD_A * 10.0
 
     @pytest.mark.parametrize("rows", [1, 2])
     def test_a_row_that_mixes_rest_and_load_does_not_decide(self, rows):
@@ -89,15 +89,15 @@ class TestRest:
         kept = slice(None if rests_after else np.flatnonzero(current_A > 1.0)[-1] + 1)
         record = Discharge(time_s[kept], voltage_V[kept], current_A[kept])
         plain, found = calibrate(REAL, method=method), calibrate(record, method=method)
-        assert found.record.shown.offset_A == pytest.approx(offset_A, abs=0.01)
+        assert found.record.history.offset_A == pytest.approx(offset_A, abs=0.01)
         assert abs(found.q_mobile_C - plain.q_mobile_C) < 2.0 * found.sd_q_mobile_C
         assert found.settled_q_mobile == (abs(offset_A) < 0.03)
-        assert found.settled_q_mobile or f"{found.record.shown.offset_A:.3g} A flow at rest" in found.reason
+        assert found.settled_q_mobile or f"{found.record.history.offset_A:.3g} A flow at rest" in found.reason
 
     def test_a_small_load_before_a_larger_one_is_none(self):
         current_A = REAL.current_A.copy()
         current_A[:2] = 0.15
-        assert Discharge(REAL.time_s, REAL.voltage_V, current_A).loaded_part(2.7).shown.offset_A == pytest.approx(
+        assert Discharge(REAL.time_s, REAL.voltage_V, current_A).loaded_part(2.7).history.offset_A == pytest.approx(
             0.0, abs=0.01
         )
 
@@ -132,11 +132,11 @@ class TestCharge:
     def test_one_that_tapered_off_proves_a_full_cell_without_a_rest(self, rest_rows, method):
         table = cycled(4.2, 0.05, rest_rows)
         (found,) = calibrate(table, method=method)
-        assert found.settled and is_right(found) and found.record.shown.charge.tapered
+        assert found.settled and is_right(found) and found.record.history.charge.tapered
         assert found.capacity_Ah == pytest.approx(found.drawn_Ah)
         # in whichever cycle it is counted
         counted = table.assign(cycle=np.where(table.current_A <= 0.0, 2, 1) if rest_rows == 0 else 1)
-        assert len(read_discharges(counted)) == 1 and read_discharges(counted)[0].shown.charge is not None
+        assert len(read_discharges(counted)) == 1 and read_discharges(counted)[0].history.charge is not None
 
     @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize(("last_A", "settled"), [(0.03, True), (0.1, None), (0.2, False), (0.3, False)])
@@ -144,7 +144,7 @@ class TestCharge:
         # about the charge that an exponential would have brought after its end
         left_C = last_A * 2000.0 / np.log(3.0 / last_A)
         (found,) = calibrate(cycled(4.2, last_A, rest_rows=1), method=method)
-        assert found.record.shown.charge.left_C == pytest.approx(left_C, rel=0.15)
+        assert found.record.history.charge.left_C == pytest.approx(left_C, rel=0.15)
         assert found.sd_q_mobile_C > left_C and found.capacity_Ah == pytest.approx(found.drawn_Ah)
         assert settled is None or found.settled_q_mobile == settled == ("C left to take" not in found.reason)
 
@@ -181,7 +181,7 @@ class TestCharge:
         assert not ChargeBefore.of(10.0 * np.arange(51), voltage_V, current_A).tapered
 
     def test_nothing_is_known_of_other_records(self):
-        assert REAL.shown == Shown() and REAL.loaded_part(2.7).shown.charge is None
+        assert REAL.history == ChargeHistory() and REAL.loaded_part(2.7).history.charge is None
 
 
 class TestCutOff:
@@ -231,7 +231,7 @@ class TestGaps:
         model_V = 3.3 - np.repeat(np.cumsum(fall_V), 12)
         wander_V = 8e-4 * np.repeat(np.random.default_rng(0).choice([0.0, 1.0], 30), 12)
         record = Samples(time_s, model_V + wander_V, np.full(360, 4.4))
-        seen = watched(record, NEW_CELL, None, (3900.0, 0.03), Shown(), model_V)
+        seen = watched(record, NEW_CELL, None, (3900.0, 0.03), ChargeHistory(), model_V)
         assert not doubtful_C(seen) and not fault_condition(seen)
 
 
@@ -249,8 +249,8 @@ class TestSwitches:
     def test_a_count_of_the_tester_leaves_none(self):
         current_A = np.where(np.arange(len(REAL.time_s)) // 3 % 2, REAL.current_A, 0.3 * REAL.current_A)
         pulsed = replace(REAL, current_A=current_A)
-        counted = replace(pulsed, shown=Shown(is_counted=True))
+        counted = replace(pulsed, history=ChargeHistory(is_counted=True))
         # but of the moment at which the load came on
         assert pulsed.unseen_C > 0.02 * pulsed.charge_C and 0.0 < counted.unseen_C < 0.02 * pulsed.unseen_C
-        sure, unsure = (watched(Samples.of(each), NEW_CELL, 1.0, (6000.0, 0.1), each.shown) for each in (counted, pulsed))
+        sure, unsure = (watched(Samples.of(each), NEW_CELL, 1.0, (6000.0, 0.1), each.history) for each in (counted, pulsed))
         assert unseen_C(unsure) == pytest.approx(np.hypot(unseen_C(sure), pulsed.unseen_C), rel=0.01)
