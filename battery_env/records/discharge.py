@@ -303,7 +303,7 @@ class Discharge:
             history = history._replace(rest_s=float(self.time_s[resting] - self.time_s[0]))
             if self._told_load_on_s is None:
                 history = history._replace(load_on_C=load_on_sd_C(self.time_s, self.current_A, first, start_s))
-        if (offset_A := rest_current_A(self.current_A, self.load)) is not None:
+        if (offset_A := rest_current_A(self.current_A)) is not None:
             history = history._replace(offset_A=offset_A)
         return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest, history=history)
 

@@ -170,15 +170,16 @@ def load_on_sd_C(time_s: FloatArray, current_A: FloatArray, first: int, load_on_
     return float(np.sqrt((late_s**3 + early_s**3) / (3.0 * (late_s + early_s))) * (current_A[first] - current_A[first - 1]))
 
 
-def rest_current_A(current_A: FloatArray, load: LoadSpan) -> float | None:
+def rest_current_A(current_A: FloatArray) -> float | None:
     """
-    What flows at rest, A: what the rests before and after a load have in common, as a small load, or the end of a charge, is
-    only before it or after. Where only the one before is recorded, what flows in it; ``None``: no rest is.
+    What flows at rest, A: what the rests before and after the large loads have in common, as a small load, or the end of a
+    charge, is only before it or after. Where only the one before is recorded, what flows in it; ``None``: no rest is.
     """
+    loaded = np.flatnonzero(is_load(current_A))
     # what is no load, before it or after, is a rest, unless a charge
     largest_A = current_A.max() - min(current_A.min(), 0.0)
     before, after = (
-        part[np.abs(part) <= LOAD_SHARE * largest_A] for part in (current_A[: load.first], current_A[load.last + 1 :])
+        part[np.abs(part) <= LOAD_SHARE * largest_A] for part in (current_A[: loaded[0]], current_A[loaded[-1] + 1 :])
     )
     before_A, after_A = (float(np.median(rest)) if len(rest) else 0.0 for rest in (before, after))
     if not len(after):
