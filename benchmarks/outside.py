@@ -17,11 +17,9 @@ goes on from there, and several work at it together.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -35,8 +33,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from battery_env.plotting import coloured, draw_over_seeds
 from benchmarks.control import roll_out
-from benchmarks.runs import POINTS, Rows, Run, Trainer, setting_of_lac
-from benchmarks.study import Study, command_line, digits, importable, markdown, natural, new_panels, positive, with_interval
+from benchmarks.runs import POINTS, Run, make_rows, rows_command_line, setting_of_lac
+from benchmarks.study import Study, digits, markdown, new_panels, with_interval
 
 #: Environment steps of each task, the cheap ones first.
 TASKS = {
@@ -101,9 +99,9 @@ def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -
     return Run(task, algorithm, ALGORITHMS[algorithm][1], seed, timesteps or TASKS[task], settings)
 
 
-def mean_return(model: OffPolicyAlgorithm, task: str) -> float:
+def mean_return(model: OffPolicyAlgorithm, run: Run) -> float:
     """Of the held-out episodes."""
-    outcome = roll_out(model, partial(gym.make, task), EPISODES)
+    outcome = roll_out(model, partial(gym.make, run.task), EPISODES)
     return -float((outcome["cost"] * outcome["length"]).mean())
 
 
@@ -215,35 +213,17 @@ def plot_learning(rows: pd.DataFrame) -> Figure:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = command_line("outside", __doc__)
-    parser.set_defaults(out=Path("docs/results/outside"))
+    parser = rows_command_line("outside", __doc__, "those of TASKS")
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=list(TASKS))
     parser.add_argument("--algos", nargs="+", default=list(ALGORITHMS), choices=list(ALGORITHMS))
-    parser.add_argument("--seeds", nargs="+", type=natural, default=[1, 2, 3, 4, 5])
-    parser.add_argument("--timesteps", type=positive, help="environment steps of every task; those of the study by default")
-    parser.add_argument("--compile", action="store_true", help="compile the updates of LAC; minutes are then no comparison")
-    parser.add_argument("--minutes", type=positive, help="then trainings stop, with a checkpoint, and none begins")
-    parser.add_argument("--checkpoints", type=Path, default=Path("results/outside"), help="folder of trainings in progress")
-    parser.add_argument("--merge", nargs="+", type=Path, default=[], metavar="CSV", help="tables whose rows are taken in, too")
     study = Study(parser, arguments)
     chosen = study.chosen
-    for name in ("minutes", "checkpoints", "merge"):
-        del study.configuration[name]
-    rows = Rows(study.out / "runs.csv")
-    for file in chosen.merge:
-        rows.merge(file)
+    in_order = sorted(chosen.tasks, key=list(TASKS).index)
     runs = [
         run_of(task, algorithm, seed, chosen.timesteps)
-        for seed, task, algorithm in product(chosen.seeds, sorted(chosen.tasks, key=list(TASKS).index), chosen.algos)
+        for seed, task, algorithm in product(chosen.seeds, in_order, chosen.algos)
     ]
-    if not study.redraws:
-        deadline = time.time() + 60 * chosen.minutes if chosen.minutes else np.inf
-        trainer = Trainer(rows.file, chosen.checkpoints, importable(mean_return), deadline=deadline, compiled=chosen.compile)
-        study.each(trainer, [(run,) for run in runs if not rows.has(run)])
-    done = rows.of(runs)
-    if done.empty:
-        print("No training is done yet: the same command goes on from the checkpoints.")
-        return
+    done = make_rows(study, runs, mean_return)
     compared = comparison(done)
     study.write({"comparison": compared}, {"learning": plot_learning(done)}, report(done, compared))
 

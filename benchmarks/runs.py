@@ -6,6 +6,7 @@ that a bare machine can make rows, too.
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
 import os
@@ -33,7 +34,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from battery_env.files import replacing
-from benchmarks.study import digest_of, versions
+from benchmarks.study import Study, command_line, digest_of, importable, natural, positive, versions
 
 #: A policy is judged so often while it is trained, at even distances, of which the last is the end.
 POINTS = 10
@@ -236,16 +237,16 @@ class Trainer:
 
     :param file: the table
     :param checkpoints: folder of the trainings in progress
-    :param judge: gives the model of a task a number, while it is trained
-    :param describe: gives the trained model of a task more of them, by name
+    :param judge: gives the model of a training a number, while it is trained
+    :param describe: gives it more of them in the end, by name
     :param deadline: when trainings stop, with a checkpoint, as ``time.time()`` has it
     :param compiled: whether updates are compiled where they can be, which changes no result but the time
     """
 
     file: Path
     checkpoints: Path
-    judge: Callable[[OffPolicyAlgorithm, str], float]
-    describe: Callable[[OffPolicyAlgorithm, str], Mapping[str, float]] | None = None
+    judge: Callable[[OffPolicyAlgorithm, Run], float]
+    describe: Callable[[OffPolicyAlgorithm, Run], Mapping[str, float]] | None = None
     deadline: float = np.inf
     compiled: bool = False
 
@@ -262,7 +263,7 @@ class Trainer:
     def _train(self, run: Run) -> None:
         th.set_num_threads(1)
         file = self.checkpoints / f"{run.name}.zip"
-        progress = Progress(run.timesteps, lambda model: self.judge(model, run.task), file, self.deadline)
+        progress = Progress(run.timesteps, lambda model: self.judge(model, run), file, self.deadline)
         env = run.environments()
         try:
             compiled = self.compiled and run.kind.startswith("sb3_lac:")
@@ -273,7 +274,48 @@ class Trainer:
         machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
         made = {"minutes": progress.seconds / 60.0, "resumed": progress.resumed, "machine": machine}
         made["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
-        described = self.describe(model, run.task) if self.describe else {}
+        described = self.describe(model, run) if self.describe else {}
         row = {**run.key, **progress.curve, **described, **made}
         Rows(self.file).add(pd.DataFrame([row]))
         file.unlink(missing_ok=True)
+
+
+def rows_command_line(name: str, document: str | None, timesteps: str) -> argparse.ArgumentParser:
+    """What studies of such rows have in common: their folder is that of what is published."""
+    parser = command_line(name, document)
+    parser.set_defaults(out=Path("docs/results") / name)
+    parser.add_argument("--seeds", nargs="+", type=natural, default=[1, 2, 3, 4, 5])
+    parser.add_argument("--timesteps", type=positive, help=f"environment steps of each training; {timesteps} by default")
+    parser.add_argument("--compile", action="store_true", help="compile the updates of LAC; minutes are then no comparison")
+    parser.add_argument("--minutes", type=positive, help="then trainings stop, with a checkpoint, and none begins")
+    parser.add_argument("--checkpoints", type=Path, default=Path("results") / name, help="folder of trainings in progress")
+    parser.add_argument("--merge", nargs="+", type=Path, default=[], metavar="CSV", help="tables whose rows are taken in, too")
+    return parser
+
+
+def make_rows(
+    study: Study,
+    runs: Sequence[Run],
+    judge: Callable[[OffPolicyAlgorithm, Run], float],
+    describe: Callable[[OffPolicyAlgorithm, Run], Mapping[str, float]] | None = None,
+) -> pd.DataFrame:
+    """
+    Make the rows of ``<out>/runs.csv`` that are missing, in their order, and return those that are there then.
+
+    :raises SystemExit: if there is none yet
+    """
+    chosen = study.chosen
+    for name in ("minutes", "checkpoints", "merge"):
+        del study.configuration[name]  # which change no row
+    rows = Rows(study.out / "runs.csv")
+    for file in chosen.merge:
+        rows.merge(file)
+    if not study.redraws:
+        deadline = time.time() + 60 * chosen.minutes if chosen.minutes else np.inf
+        describe = importable(describe) if describe else None
+        trainer = Trainer(rows.file, chosen.checkpoints, importable(judge), describe, deadline, chosen.compile)
+        study.each(trainer, [(run,) for run in runs if not rows.has(run)])
+    done = rows.of(runs)
+    if done.empty:
+        raise SystemExit("No training is done yet: the same command goes on from the checkpoints.")
+    return done

@@ -4,6 +4,7 @@ import gymnasium as gym
 
 from sb3_lac.envs.base import CostEnv
 from sb3_lac.envs.cart_pole import CartPoleCostEnv
+from sb3_lac.envs.drawing import DomainRandomization
 from sb3_lac.envs.linear import LinearCostEnv
 from sb3_lac.envs.oscillator import OscillatorEnv
 from sb3_lac.envs.pendulum import PendulumCostEnv
@@ -26,6 +27,7 @@ for env_id, entry_point, max_episode_steps in (
 __all__ = [
     "CartPoleCostEnv",
     "CostEnv",
+    "DomainRandomization",
     "LinearCostEnv",
     "OscillatorEnv",
     "PendulumCostEnv",

@@ -7,6 +7,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_lac.envs.drawing import Draw, Ranges
+
 if TYPE_CHECKING:  # slow to import, and only pictures need it
     from matplotlib.axes import Axes
 
@@ -25,6 +27,13 @@ def check_not_negative(**values: float) -> None:
             raise ValueError(f"{name}={value} must be finite and at least 0.")
 
 
+def check_whole(**values: float) -> None:
+    """Refuse numbers of steps that make no sense."""
+    for name, value in values.items():
+        if value != int(value):
+            raise ValueError(f"{name}={value} must be a whole number of steps.")
+
+
 def _noise_std(name: str, std: float | Sequence[float], n: int) -> np.ndarray | None:
     """The standard deviation of each of n variables, None if there is no noise."""
     values = np.array(std, dtype=np.float64)
@@ -41,7 +50,8 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
 
     Actions lie in [-1, 1]; each problem scales them. ``reset(options={"state": ...})`` starts from a given state.
 
-    The disturbances are arguments of every problem, and off by default. A reference controller does not know of them.
+    The disturbances are arguments of every problem, and off by default. A reference controller does not know of them. They are
+    the same in all episodes, or drawn anew for each: a policy that is trained so learns a plant that changes.
 
     :param parameters: Physical parameters of the problem by name. They become attributes of the environment
     :param state_low: Smallest value of each state variable, shape (n,)
@@ -55,6 +65,11 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         step, in its unit; one number for all, or one for each
     :param observation_noise: Disturbance: the same for each observed variable
     :param action_delay: Disturbance: steps until an action takes effect. Before that the plant gets zeros
+    :param drawn: Disturbances that each episode draws anew, uniformly, in place of what is fixed: by name the smallest and
+        the largest value of any of ``parameters``, ``impulse``, ``process_noise``, ``observation_noise`` and
+        ``action_delay``. ``info["drawn"]`` tells what was drawn
+    :param last_actions: How many of the last actions are added to the end of an observation, the latest first, zeros before
+        the start: what a policy needs to know of actions that are still to take effect
     :param render_mode: ``"rgb_array"`` for pictures of the plant and of the episode so far, or None
     """
 
@@ -67,6 +82,8 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     error_name: str
     #: An ``info["error"]`` up to which an episode has reached the goal
     error_tolerance: float
+    impulse: float
+    action_delay: int
 
     def __init__(
         self,
@@ -82,6 +99,8 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         process_noise: float | Sequence[float] = 0.0,
         observation_noise: float | Sequence[float] = 0.0,
         action_delay: int = 0,
+        drawn: Ranges | None = None,
+        last_actions: int = 0,
         render_mode: str | None = None,
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -89,27 +108,46 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         changed = dict(changed_parameters or {})
         if unknown := changed.keys() - parameters.keys():
             raise ValueError(f"changed_parameters has {sorted(unknown)}, which are none of {sorted(parameters)}.")
-        self._check_parameters(**parameters)
-        self._check_parameters(**changed)
-        check_not_negative(impulse=impulse, action_delay=action_delay)
         check_positive(impulse_interval=impulse_interval)
-        for name, steps in {"impulse_interval": impulse_interval, "action_delay": action_delay}.items():
-            if steps != int(steps):
-                raise ValueError(f"{name}={steps} must be a whole number of steps.")
+        check_not_negative(last_actions=last_actions)
+        check_whole(impulse_interval=impulse_interval, last_actions=last_actions)
+        self.state_low, self.state_high = state_low, state_high
+        self.action_space = spaces.Box(-1.0, 1.0, (n_actions,), np.float32)
+        self._plant_space, self.observation_space = observation_space, observation_space
+        if last_actions > 0:
+            ones = np.ones(n_actions * last_actions, np.float32)
+            self.observation_space = spaces.Box(
+                np.append(observation_space.low, -ones), np.append(observation_space.high, ones), dtype=np.float32
+            )
+        self.impulse_interval, self._zero_action = impulse_interval, np.zeros(n_actions)
+        self._last_actions = deque([self._zero_action] * last_actions, maxlen=last_actions)
         #: The physical parameters as they are known, which make this problem without disturbances
         self.nominal_parameters = dict(parameters)
-        for name, value in {**parameters, **changed}.items():
-            setattr(self, name, value)
-        self.state_low, self.state_high = state_low, state_high
-        self.observation_space = observation_space
-        self.action_space = spaces.Box(-1.0, 1.0, (n_actions,), np.float32)
-        self.impulse, self.impulse_interval = impulse, impulse_interval
-        self.action_delay, self._zero_action = int(action_delay), np.zeros(n_actions)
-        self._process_noise = _noise_std("process_noise", process_noise, len(state_high))
-        self._observation_noise = _noise_std("observation_noise", observation_noise, observation_space.shape[0])
+        disturbances = {"impulse": impulse, "process_noise": process_noise, "observation_noise": observation_noise}
+        fixed = {**parameters, **disturbances, "action_delay": action_delay}
+        self._draw_disturbances = Draw(drawn or {}, {**dict.fromkeys(fixed, 0.0), "action_delay": 0})
+        self._drawn: dict[str, float] = {}
+        for values in (self._draw_disturbances.smallest, self._draw_disturbances.largest, {**fixed, **changed}):
+            self._disturb(values)
         self.render_mode = render_mode
         self.state: np.ndarray | None = None
         self.n_steps = 0
+
+    def _disturb(self, values: Mapping[str, Any]) -> None:
+        """Let physical parameters and disturbances have other values, unless one makes no sense."""
+        for name, value in values.items():
+            if name in self.nominal_parameters:
+                self._check_parameters(**{name: value})
+                setattr(self, name, value)
+            elif name == "process_noise":
+                self._process_noise = _noise_std(name, value, len(self.state_high))
+            elif name == "observation_noise":
+                self._observation_noise = _noise_std(name, value, self._plant_space.shape[0])
+            else:
+                check_not_negative(**{name: value})
+                if name == "action_delay":
+                    check_whole(action_delay=value)
+                setattr(self, name, value)
 
     def _check_parameters(self, **parameters: float) -> None:
         """Refuse physical parameters that make no sense."""
@@ -146,12 +184,17 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _noisy_observation(self) -> np.ndarray:
         observation = self._observation()
-        if self._observation_noise is None:
-            return observation
-        noise = self._observation_noise * self.np_random.standard_normal(len(observation))
-        space = self.observation_space
-        assert isinstance(space, spaces.Box)
-        return np.clip(observation + noise, space.low, space.high).astype(np.float32)
+        if self._observation_noise is not None:
+            noise = self._observation_noise * self.np_random.standard_normal(len(observation))
+            observation = np.clip(observation + noise, self._plant_space.low, self._plant_space.high).astype(np.float32)
+        if self._last_actions:
+            observation = np.concatenate((observation, *reversed(self._last_actions)), dtype=np.float32)
+        return observation
+
+    def _info(self, **told: float) -> dict[str, Any]:
+        """What is told beside an observation."""
+        info: dict[str, Any] = {**told, "error": self._error()}
+        return {**info, "drawn": dict(self._drawn)} if self._drawn else info
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode, with ``options={"state": ...}`` from a given state; ``info`` holds its ``"error"``."""
@@ -166,11 +209,15 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
                     f"options['state']={options['state']!r} must hold {len(self.state_high)} numbers {self.state_names} "
                     f"from {self.state_low.tolist()} to {self.state_high.tolist()}."
                 )
+        # After the start, which is the same without disturbances
+        self._drawn = self._draw_disturbances(self.np_random)
+        self._disturb(self._drawn)
         self.state = start
         self.n_steps = 0
         self._history = [(start, np.nan)]
-        self._delayed_actions = deque([self._zero_action] * self.action_delay)
-        return self._noisy_observation(), {"error": self._error()}
+        self._delayed_actions = deque([self._zero_action] * int(self.action_delay))
+        self._last_actions.extend([self._zero_action] * len(self._last_actions))
+        return self._noisy_observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Move on by one step; ``info`` holds ``"cost"``, minus the reward, and ``"error"``."""
@@ -183,6 +230,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         if action.shape != self.action_space.shape or not np.isfinite(action).all():
             raise ValueError(f"action={action} must be finite numbers in [-1, 1], shape {self.action_space.shape}.")
         action = np.minimum(np.maximum(action, -1.0), 1.0)
+        self._last_actions.append(action)
         if self.action_delay > 0:
             self._delayed_actions.append(action)
             action = self._delayed_actions.popleft()
@@ -198,7 +246,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         self.n_steps += 1
         if self.render_mode is not None:
             self._history.append((self.state, cost))
-        return self._noisy_observation(), -cost, terminated, False, {"cost": cost, "error": self._error()}
+        return self._noisy_observation(), -cost, terminated, False, self._info(cost=cost)
 
     def render(self) -> np.ndarray | None:
         """Draw the plant, and to the right of it states and costs so far: a picture of shape (300, 800, 3)."""

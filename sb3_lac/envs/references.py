@@ -43,6 +43,8 @@ class ReferenceController(ABC):
 
     def __init__(self, model: CostEnv) -> None:
         self.observation_space, self.action_space = model.observation_space, model.action_space
+        assert model.observation_space.shape is not None
+        self._n_seen = model.observation_space.shape[0]
 
     @abstractmethod
     def _actions(self, observations: np.ndarray) -> np.ndarray:
@@ -71,7 +73,8 @@ class ReferenceController(ABC):
         size = self.observation_space.shape or ()
         if observations.ndim not in (1, 2) or observations.shape[-1:] != size:
             raise ValueError(f"observation has shape {observations.shape}, and not {size} or (n, {size[0]}).")
-        actions = self._actions(np.atleast_2d(observations))
+        # Without last actions: these controllers know of no delay
+        actions = self._actions(np.atleast_2d(observations)[:, : self._n_seen])
         limited = np.clip(actions, -1.0, 1.0).astype(np.float32)
         return (limited if observations.ndim == 2 else limited[0]), state
 
@@ -238,4 +241,6 @@ def reference_controller(env: gym.Env[Any, Any]) -> ReferenceController:
     if env.observation_space != problem.observation_space or env.action_space != problem.action_space:
         raise ValueError(f"env={env} has a wrapper that changes observations or actions, which the controller would not know.")
     make_problem: Any = type(problem)  # each has arguments of its own
-    return make_controller(make_problem(**problem.nominal_parameters))
+    controller: ReferenceController = make_controller(make_problem(**problem.nominal_parameters))
+    controller.observation_space = env.observation_space
+    return controller

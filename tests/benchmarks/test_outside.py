@@ -75,5 +75,5 @@ def test_the_study_trains_writes_and_goes_on(tmp_path, monkeypatch, capsys):
     done.assign(seed=done["seed"] + 2).to_csv(other, index=False)
     outside.main([*command, "--seeds", "1", "2", "3", "--merge", str(other), "--redraw"])
     assert len(Rows(out / "runs.csv").read()) == 8 and "| 3 " in (out / "outside.md").read_text()
-    outside.main([*command, "--seeds", "9", "--redraw"])
-    assert "No training is done yet" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="No training is done yet"):
+        outside.main([*command, "--seeds", "9", "--redraw"])

@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from stable_baselines3.common.env_checker import check_env
 
-from sb3_lac.envs import CartPoleCostEnv, LinearCostEnv, OscillatorEnv, PendulumCostEnv, QuadrotorCostEnv, VehicleCostEnv
+from sb3_lac.envs import (
+    CartPoleCostEnv,
+    DomainRandomization,
+    LinearCostEnv,
+    OscillatorEnv,
+    PendulumCostEnv,
+    QuadrotorCostEnv,
+    VehicleCostEnv,
+    reference_controller,
+)
 from sb3_lac.envs.base import CostEnv
 
 EPISODE_STEPS = {
@@ -334,6 +343,108 @@ class TestDisturbances:
         np.testing.assert_array_equal(plain.state, disturbed.state)
         check_env(disturbed)
 
+    def test_each_episode_draws_within_its_ranges_and_is_that_of_what_was_drawn(self, make, actions):
+        name, value = next(iter(make().nominal_parameters.items()))
+        ranges = {name: (0.9 * value, 1.1 * value), "action_delay": (0, 2), "impulse": (0.1, 0.2)}
+        env, seen = self.quiet(make, drawn=ranges), []
+        for seed in range(12):
+            _, info = env.reset(seed=seed)
+            drawn = info["drawn"]
+            assert env.step(actions[0])[-1]["drawn"] == drawn and drawn.keys() == ranges.keys()
+            assert all(low <= drawn[each] <= high for each, (low, high) in ranges.items())
+            fixed = self.quiet(make, **{name: drawn.pop(name)}, **drawn)
+            # the direction of a push is drawn, too
+            fixed.impulse = env.impulse = 0.0
+            env.reset(seed=seed), fixed.reset(seed=seed)
+            env.impulse = 0.0
+            for action in actions:
+                assert env.step(action)[1:3] == fixed.step(action)[1:3]
+            seen.append(drawn["action_delay"])
+        assert set(seen) == {0, 1, 2} and all(type(delay) is int for delay in seen)
+        assert env.nominal_parameters == make().nominal_parameters
+        check_env(env)
+
+    def test_drawn_noise_is_that_of_a_fixed_one(self, make, actions):
+        sizes = []
+        for seed in range(4):
+            env = self.quiet(make, drawn={"observation_noise": (0.01, 0.5), "process_noise": (0.0, 1e-3)})
+            _, info = env.reset(seed=seed)
+            twin = self.quiet(make, **info["drawn"])
+            twin.reset(seed=0)
+            twin.np_random, twin.state = copy.deepcopy(env.np_random), env.state
+            for action in actions:
+                np.testing.assert_array_equal(env.step(action)[0], twin.step(action)[0])
+            sizes.append(info["drawn"]["observation_noise"])
+        assert len(set(sizes)) == 4
+
+    def test_last_actions_are_at_the_end_of_what_is_seen(self, make, actions):
+        plain, env = self.quiet(make), self.quiet(make, last_actions=2)
+        n, m = plain.observation_space.shape[0], env.action_space.shape[0]
+        assert env.observation_space.shape == (n + 2 * m,)
+        for _ in range(2):  # the second episode knows nothing of the first
+            start, _ = plain.reset(seed=0)
+            seen, _ = env.reset(seed=0)
+            np.testing.assert_array_equal(seen, [*start, *np.zeros(2 * m)])
+            before = np.zeros(m)
+            for action in 4.0 * actions:
+                expected, seen = plain.step(action)[0], env.step(action)[0]
+                last = np.clip(action, -1.0, 1.0)
+                np.testing.assert_array_equal(seen, np.float32([*expected, *last, *before]))
+                assert env.observation_space.contains(seen)
+                before = last
+        controller = reference_controller(env)
+        np.testing.assert_array_equal(controller.predict(seen)[0], reference_controller(plain).predict(expected)[0])
+
+
+class TestDomainRandomization:
+    """Attributes of any environment are drawn anew."""
+
+    @settings(max_examples=25, deadline=None)
+    @given(st.floats(0.1, 10.0), st.floats(0.0, 5.0), st.integers(1, 9), st.integers(0, 9), st.integers(0, 2**31))
+    def test_attributes_lie_within_their_ranges_and_the_seed_decides(self, low, width, whole, more, seed):
+        ranges = {"m": (low, low + width), "max_speed": (whole, whole + more)}
+        env = DomainRandomization(gym.make("Pendulum-v1"), ranges)
+        _, info = env.reset(seed=seed)
+        drawn = info["drawn"]
+        assert all(low <= drawn[name] <= high for name, (low, high) in ranges.items()) and type(drawn["max_speed"]) is int
+        assert (env.unwrapped.m, env.unwrapped.max_speed) == (drawn["m"], drawn["max_speed"])
+        assert env.step(env.action_space.sample())[-1]["drawn"] == drawn
+        following = env.reset()[1]["drawn"]
+        assert env.reset(seed=seed)[1]["drawn"] == drawn and env.reset()[1]["drawn"] == following
+
+    def test_another_mass_moves_otherwise_and_starts_alike(self):
+        starts, steps = [], []
+        for env in (gym.make("Pendulum-v1"), DomainRandomization(gym.make("Pendulum-v1"), {"m": (2.0, 2.0)})):
+            starts.append(env.reset(seed=1)[0])
+            steps.append(env.step(np.ones(1, np.float32))[0])
+        np.testing.assert_array_equal(*starts)
+        assert (steps[0] != steps[1]).any()
+
+    def test_both_checkers_find_nothing_and_its_spec_makes_it_again(self):
+        env = DomainRandomization(gym.make("Pendulum-v1"), {"l": (0.8, 1.2)})
+        check_env(env)
+        again = gym.make(env.spec)
+        assert again.reset(seed=3)[1] == env.reset(seed=3)[1]
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*different from the unwrapped version.*")
+            check_gymnasium_env(env, skip_render_check=True)
+
+    @pytest.mark.parametrize(
+        ("drawn", "message"),
+        [
+            ({"mass": (1.0, 2.0)}, r"drawn has \['mass'\], which are none of \['dt', 'g', "),
+            ({"action_space": (1.0, 2.0)}, "which are none of"),
+            ({"m": (2.0, 1.0)}, r"drawn\['m'\]=\(2.0, 1.0\) must be the smallest and the largest value"),
+            ({"m": (1.0, np.inf)}, "two finite numbers"),
+            ({"m": 1.0}, "two finite numbers"),
+            ({"m": ("1", "2")}, "two finite numbers"),
+            ({"m": (1.0, 2.0, 3.0)}, "two finite numbers"),
+        ],
+    )
+    def test_bad_ranges_are_named(self, drawn, message):
+        with pytest.raises(ValueError, match=message):
+            DomainRandomization(gym.make("Pendulum-v1"), drawn)
+
 
 def linear_roll_outs(env, gain, n_episodes, n_steps):
     """States and costs of many roll-outs of the policy u = -K s, without the environment."""
@@ -374,6 +485,17 @@ def test_exact_value_is_the_mean_discounted_sum_of_costs():
         (OscillatorEnv, {"process_noise": -1.0}, "process_noise=-1.0 must be a number, or 6 of them, finite and at least 0"),
         (PendulumCostEnv, {"damping_Nms": -0.1}, "damping_Nms=-0.1 must be finite and at least 0"),
         (PendulumCostEnv, {"changed_parameters": {"length": 2.0}}, r"has \['length'\], which are none of \['damping_Nms', "),
+        (
+            VehicleCostEnv,
+            {"drawn": {"frictions": (0.5, 1.0)}},
+            r"drawn has \['frictions'\], which are none of \['action_delay', ",
+        ),
+        (VehicleCostEnv, {"drawn": {"friction": (0.0, 1.0)}}, "friction=0.0 must be positive"),
+        (VehicleCostEnv, {"drawn": {"steering_max_rad": (0.5, 2.0)}}, "steering_max_rad=2.0 must be at most 1"),
+        (VehicleCostEnv, {"drawn": {"action_delay": (0, 1.5)}}, "action_delay=1.5 must be a whole number"),
+        (VehicleCostEnv, {"drawn": {"process_noise": (-1.0, 1.0)}}, "process_noise=-1.0 must be a number"),
+        (VehicleCostEnv, {"last_actions": 0.5}, "last_actions=0.5 must be a whole number"),
+        (VehicleCostEnv, {"last_actions": -1}, "last_actions=-1 must be finite and at least 0"),
         (QuadrotorCostEnv, {"action_delay": 0.5}, "action_delay=0.5 must be a whole number"),
         (VehicleCostEnv, {"steering_max_rad": 1.5}, "steering_max_rad=1.5 must be at most 1"),
         (CartPoleCostEnv, {"impulse_N": 1.0, "impulse": 2.0}, "are the same: give one of them"),

@@ -1,0 +1,162 @@
+"""
+A plant that changes: LAC, SAC and TQC, all with LAC's one setting, trained on control problems that draw all of their
+disturbances anew for each episode.
+
+.. code-block:: bash
+
+  python -m benchmarks.changing_plant --jobs 2 --compile
+  python -m benchmarks.changing_plant --envs CartPoleCost-v0 --last-actions 2 --compile
+
+Parameters, pushes, noises and the delay of actions are drawn together, in ranges that hold what ``benchmarks.stabilisation``
+tries policies with. They are judged by the same disturbances one at a time, and by one outside of each range. With
+``--last-actions`` an observation tells them the last actions, too. A training that is done is a row of ``runs.csv``, as those
+of ``benchmarks.outside`` are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import product
+from typing import Any
+
+import gymnasium as gym
+import pandas as pd
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from battery_env.evaluation import over_seeds
+from benchmarks.control import DISTURBANCES, IMPULSE_INTERVAL, conditions, roll_out
+from benchmarks.runs import Run, make_rows, rows_command_line, setting_of_lac
+from benchmarks.study import Study, digits, markdown, natural, table_of
+
+#: By environment the parameter that is drawn, its range, and a value outside; the first three are trained by default.
+PARAMETERS = {
+    "VehicleCost-v0": ("friction", (0.5, 1.0), 0.4),
+    "Oscillator-v0": ("protein_decay", (0.05, 0.07), 0.045),
+    "CartPoleCost-v0": ("pole_half_length_m", (0.4, 1.0), 1.2),
+    "QuadrotorCost-v0": ("mass_kg", (0.8, 1.2), 1.3),
+    "PendulumCost-v0": ("mass_kg", (0.7, 1.4), 1.6),
+    "LinearCost-v0": ("control_max", (1.0, 3.0), 0.75),
+}
+#: What is outside of the ranges of pushes and noises, in parts of their ends; delays are a step longer.
+BEYOND = 1.5
+TIMESTEPS = 60_000
+ALGORITHMS = {
+    "lac": ("LAC", "sb3_lac:LAC"),
+    "sac": ("SAC", "stable_baselines3:SAC"),
+    "tqc": ("TQC", "sb3_contrib:TQC"),
+}
+EPISODES = 100
+# the episodes of learning curves have other starts
+_CURVE_EPISODES, _CURVE_SEED = 30, 40_000
+#: LAC is level with a rival that costs at least so much of what it costs.
+LEVEL = 0.98
+
+
+def drawn(env_id: str) -> dict[str, tuple[float, float]]:
+    """What each episode of a training draws: up to what the published table of robustness tries policies with."""
+    impulse, _, process_noise, observation_noise, delay = DISTURBANCES[env_id]
+    name, ends, _ = PARAMETERS[env_id]
+    largest = {"impulse": impulse, "process_noise": process_noise, "observation_noise": observation_noise}
+    return {name: ends, **{each: (0.0, size) for each, size in largest.items()}, "action_delay": (0, delay)}
+
+
+def outside(env_id: str) -> dict[str, dict[str, Any]]:
+    """Disturbances beyond the ranges, one at a time."""
+    impulse, _, process_noise, observation_noise, delay = DISTURBANCES[env_id]
+    name, _, value = PARAMETERS[env_id]
+    return {
+        "impulses": {"impulse": BEYOND * impulse, "impulse_interval": IMPULSE_INTERVAL},
+        "other parameters": {"changed_parameters": {name: value}},
+        "process noise": {"process_noise": BEYOND * process_noise},
+        "observation noise": {"observation_noise": BEYOND * observation_noise},
+        "action delay": {"action_delay": delay + 1},
+    }
+
+
+def run_of(env_id: str, algorithm: str, seed: int, last_actions: int = 0, timesteps: int | None = None) -> Run:
+    """A training of this study."""
+    label, kind = ALGORITHMS[algorithm]
+    environment = {"drawn": drawn(env_id), "impulse_interval": IMPULSE_INTERVAL}
+    if last_actions:
+        label, environment["last_actions"] = f"{label}, {last_actions} last actions", last_actions
+    return Run(env_id, label, kind, seed, timesteps or TIMESTEPS, setting_of_lac(), environment)
+
+
+def cost_while_training(model: OffPolicyAlgorithm, run: Run) -> float:
+    """A step of the plant that changes, as in the training."""
+    make = partial(gym.make, run.task, **run.environment)
+    return float(roll_out(model, make, _CURVE_EPISODES, _CURVE_SEED)["cost"].mean())
+
+
+def costs(model: OffPolicyAlgorithm, run: Run) -> dict[str, float]:
+    """Cost per step, and share of episodes that die, under each disturbance within the ranges and outside."""
+    seen = {name: value for name, value in run.environment.items() if name == "last_actions"}
+    tried = {**conditions(run.task), **{f"outside: {name}": each for name, each in outside(run.task).items()}}
+    found: dict[str, float] = {}
+    for name, arguments in tried.items():
+        outcome = roll_out(model, partial(gym.make, run.task, **arguments, **seen), EPISODES)
+        found |= {name: outcome["cost"].mean(), f"died: {name}": outcome["died"].mean()}
+    return found
+
+
+def cost_table(rows: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
+    """Interquartile means over seeds, and in brackets the share of episodes that die, if some do."""
+
+    def said(group: pd.DataFrame, name: str) -> str:
+        died = group[f"died: {name}"].mean()
+        return digits(float(over_seeds(group[name])[0])) + (f" ({100 * died:.0f} %)" if died > 0 else "")
+
+    cells = {"seeds": lambda group: str(len(group))}
+    cells |= {name.removeprefix("outside: "): partial(said, name=name) for name in names}
+    return table_of(rows, {"task": "environment", "algorithm": "policy"}, cells)
+
+
+def cells_held(rows: pd.DataFrame, names: Sequence[str]) -> str:
+    """In how many cells LAC is ahead of the best of SAC and TQC, or level, where all three saw the same."""
+    held, of = 0, 0
+    for _, of_env in rows.groupby("task", sort=False):
+        for seen in ("", *sorted({name.partition(",")[2] for name in of_env["algorithm"] if "," in name})):
+            by_name = of_env.groupby("algorithm")
+            who = [f"{label},{seen}" if seen else label for label, _ in ALGORITHMS.values()]
+            if set(who) <= set(by_name.groups):
+                lac, *others = ([float(over_seeds(by_name.get_group(each)[name])[0]) for name in names] for each in who)
+                held += sum(LEVEL * own <= min(rivals) for own, *rivals in zip(lac, *others, strict=True))
+                of += len(names)
+    return f"{held} of {of}"
+
+
+def report(rows: pd.DataFrame, within: Sequence[str], beyond: Sequence[str]) -> str:
+    """Two tables, as Markdown."""
+    text = ""
+    for where, names in (("Within the ranges of the training", within), ("Outside of them", beyond)):
+        text += f"{where}: cost per step, interquartile mean over seeds, and in brackets the share of episodes that die.\n"
+        text += f"LAC is ahead of the best of SAC and TQC, or within 2 %, in {cells_held(rows, names)} cells:\n\n"
+        text += markdown(cost_table(rows, names)) + "\n"
+    return text.rstrip() + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = rows_command_line("changing_plant", __doc__, str(TIMESTEPS))
+    parser.add_argument("--envs", nargs="+", default=list(PARAMETERS)[:3], choices=list(PARAMETERS))
+    parser.add_argument("--algos", nargs="+", default=list(ALGORITHMS), choices=list(ALGORITHMS))
+    parser.add_argument("--last-actions", nargs="+", type=natural, default=[0], help="how many of them policies see")
+    study = Study(parser, arguments)
+    chosen = study.chosen
+    runs = [
+        run_of(env_id, algorithm, seed, last_actions, chosen.timesteps)
+        for seed, last_actions, env_id, algorithm in product(chosen.seeds, chosen.last_actions, chosen.envs, chosen.algos)
+    ]
+    study.configuration["drawn"] = {env_id: drawn(env_id) for env_id in chosen.envs}
+    done = make_rows(study, runs, cost_while_training, costs)
+    done = done.sort_values(
+        ["task", "algorithm"], key=lambda names: names.map(list(dict.fromkeys(names)).index), kind="stable"
+    )
+    within = list(conditions(chosen.envs[0]))
+    beyond = [f"outside: {name}" for name in outside(chosen.envs[0])]
+    study.write({}, {}, report(done, within, beyond))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+import inspect
+from collections.abc import Mapping, Sequence
+from numbers import Integral, Real
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+
+#: By name the smallest and the largest value
+Ranges = Mapping[str, Sequence[float]]
+
+
+class Draw:
+    """
+    Numbers that each episode draws anew, uniformly and independently.
+
+    :param ranges: Smallest and largest value of each, by name
+    :param present: The present values of what can be drawn. Where one is a whole number, and both ends are, whole numbers are
+        drawn, the ends among them
+    """
+
+    def __init__(self, ranges: Ranges, present: Mapping[str, float]) -> None:
+        if unknown := ranges.keys() - present.keys():
+            raise ValueError(f"drawn has {sorted(unknown)}, which are none of {sorted(present)}.")
+        for name, ends in ranges.items():
+            values = np.array(ends)
+            if values.shape != (2,) or values.dtype.kind not in "iuf" or not -np.inf < values[0] <= values[1] < np.inf:
+                raise ValueError(f"drawn[{name!r}]={ends!r} must be the smallest and the largest value, two finite numbers.")
+        #: All of them at their smallest, and at their largest
+        self.smallest, self.largest = ({name: ends[end] for name, ends in ranges.items()} for end in (0, 1))
+        self._is_whole = {
+            name: isinstance(present[name], Integral) and all(float(end).is_integer() for end in ends)
+            for name, ends in ranges.items()
+        }
+
+    def __call__(self, generator: np.random.Generator) -> dict[str, float]:
+        """Draw all of them."""
+        return {
+            name: (
+                int(generator.integers(int(low), int(self.largest[name]), endpoint=True))
+                if self._is_whole[name]
+                else float(generator.uniform(low, self.largest[name]))
+            )
+            for name, low in self.smallest.items()
+        }
+
+
+class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """
+    Domain randomisation of any environment: each episode draws attributes of ``env.unwrapped`` anew, so that a policy is
+    trained for a plant that changes. The cost environments do this by their own argument ``drawn``.
+
+    .. code-block:: python
+
+      env = DomainRandomization(gym.make("Pendulum-v1"), {"m": (0.8, 1.2), "l": (0.8, 1.2)})
+      _, info = env.reset(seed=0)
+      print(info["drawn"])
+
+    They must be numbers that the environment reads while it runs: what it has copied, as into a simulator, stays as it is.
+
+    :param env: The environment
+    :param drawn: Smallest and largest value of each attribute, in its unit; drawn uniformly, and in whole numbers where the
+        attribute and both ends are
+    :raises ValueError: If an attribute is no number of the environment, or a range makes no sense
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], drawn: Ranges) -> None:
+        RecordConstructorArgs.__init__(self, drawn=drawn)
+        super().__init__(env)
+        plant = env.unwrapped
+        numbers = {name: inspect.getattr_static(plant, name) for name in dir(plant) if not name.startswith("_")}
+        numbers = {name: value for name, value in numbers.items() if isinstance(value, Real) and not isinstance(value, bool)}
+        self._draw = Draw(drawn, numbers)
+        self._generator = np.random.default_rng()
+        self._drawn: dict[str, float] = {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Draw, and start an episode; ``info["drawn"]`` says what was drawn, here and after each step."""
+        if seed is not None:
+            # Not the numbers of the environment once more, which has this seed, too
+            self._generator = np.random.default_rng((seed, 1))
+        self._drawn = self._draw(self._generator)
+        for name, value in self._drawn.items():
+            setattr(self.env.unwrapped, name, value)
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, {**info, "drawn": dict(self._drawn)}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Move on by one step."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, {**info, "drawn": dict(self._drawn)}
