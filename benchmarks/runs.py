@@ -84,7 +84,7 @@ class Run:
     @property
     def name(self) -> str:
         """A name for files, that no other run has."""
-        return f"{self.task}_{self.algorithm}_seed{self.seed}_{digest_of(self.key)}"
+        return f"{self.task}_{self.algorithm}_seed{self.seed}_{digest_of(self.key)}".replace(", ", "_").replace(" ", "_")
 
     def environments(self) -> VecEnv:
         """What it is trained in."""
