@@ -136,7 +136,6 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
         self.largest_reward.fill_(self.reward_bound or 0.0)
         self.update_offset(self._vec_normalize_env)
-        self._terminations = Terminations()
 
     def _setup_lr_schedule(self) -> None:
         super()._setup_lr_schedule()
@@ -257,8 +256,6 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self._refuse_observation("observation", said)
         for index in np.flatnonzero(dones):
             self._refuse_observation("last observation", infos[index].get("terminal_observation"))
-        if self._n_updates == 0:
-            self._terminations.see(paid, dones, infos)
         # The largest reward of a step, which n-step returns do not tell
         if paid.max() > 0 and paid.max() > self.largest_reward:
             if self.n_costs == math.inf and self.largest_reward == 0:
@@ -327,8 +324,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
                 yield from zip(split(replay_data, n_batches), split(costs, n_batches), strict=True)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        if self._n_updates == 0:
-            self._terminations.warn_if_free(self.n_costs, float(self.largest_reward))
+        # Where living pays, an end costs the bound for ever
+        if self._n_updates == 0 and not self.largest_reward > 0:
+            warn_of_free_terminations(self.replay_buffer, self.n_costs)
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         # Update learning rates according to their schedules
@@ -425,7 +423,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return model
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["actor", "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target", "_compiled", "_terminations"]
+        own = ["actor", "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target", "_compiled"]
         return super()._excluded_save_params() + own
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -435,37 +433,27 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return [*state_dicts, "ent_coef_optimizer"], ["log_lambda", "log_ent_coef"]
 
 
-class Terminations:
-    """What is collected before the first update, which tells whether a termination has a price."""
-
-    def __init__(self) -> None:
-        # Number, sum, least and largest of the costs of steps that go on, and of those that end an episode
-        self.seen = {ends: (0, 0.0, math.inf, -math.inf) for ends in (False, True)}
-
-    def see(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
-        """Note a step of all environments. A time limit is no termination."""
-        for cost, done, info in zip((0.0 - rewards).tolist(), dones, infos, strict=True):
-            ends = bool(done and not info.get("TimeLimit.truncated", False))
-            number, total, cheapest, dearest = self.seen[ends]
-            self.seen[ends] = number + 1, total + cost, min(cheapest, cost), max(dearest, cost)
-
-    def warn_if_free(self, n_costs: float, largest_reward: float) -> None:
-        """Warn if the last step before a termination costs no more than another step does."""
-        (number, total, cheapest, dearest), (n_ends, total_of_ends, _, _) = self.seen[False], self.seen[True]
-        # Where living pays, an end costs the bound for ever
-        if not number or not n_ends or largest_reward > 0:
-            return
-        last = total_of_ends / n_ends
-        price = total / number * n_costs
-        # An end that costs less than any other step is a goal
-        if cheapest <= last <= dearest and price > 0:
-            warnings.warn(
-                f"The last step before a termination costs {last:.3g} on average, no more than another step does (up to "
-                f"{dearest:.3g}). Where the end is the goal, all is well. Where it is a failure, to fail early is the "
-                "cheapest policy of any algorithm: give the last step a cost of its own, above that of going on, here about "
-                f"{price:.3g} (what L is where each step has the mean cost).",
-                stacklevel=3,
-            )
+def warn_of_free_terminations(replay_buffer: ReplayBuffer | None, n_costs: float) -> None:
+    """Warn if, in what is stored, the last step before a termination costs no more than another step does."""
+    # A time limit is no termination, and some buffers cannot tell
+    if not isinstance(replay_buffer, ReplayBuffer) or not replay_buffer.handle_timeout_termination:
+        return
+    stored = slice(replay_buffer.size())
+    costs = 0.0 - replay_buffer.rewards[stored]
+    ends = (replay_buffer.dones[stored] > 0) & (replay_buffer.timeouts[stored] == 0)
+    if not ends.any() or ends.all():
+        return
+    others, last = costs[~ends], costs[ends].mean()
+    price = others.mean() * n_costs
+    # An end that costs less than any other step is a goal
+    if others.min() <= last <= others.max() and price > 0:
+        warnings.warn(
+            f"The last step before a termination costs {last:.3g} on average, no more than another step does (up to "
+            f"{others.max():.3g}). Where the end is the goal, all is well. Where it is a failure, to fail early is the "
+            "cheapest policy of any algorithm: give the last step a cost of its own, above that of going on, here about "
+            f"{price:.3g} (what L is where each step has the mean cost).",
+            stacklevel=3,
+        )
 
 
 def check_rate(name: str, rate: float | Schedule) -> None:

@@ -1,6 +1,5 @@
 """What enters from an environment: terminations that cost nothing, and numbers that are not finite."""
 
-import pickle
 import warnings
 
 import gymnasium as gym
@@ -82,13 +81,6 @@ def test_warning_names_the_costs(make_model):
     assert "costs 2 on average" in message and "(up to 3)" in message and "about 8 " in message
     (message,) = warnings_of(make_model(Fixed(), n_collect=0, gamma=1.0, learning_starts=39))
     assert "about inf " in message
-
-
-def test_what_is_seen_before_the_first_update_takes_no_memory(make_model):
-    model = make_model(n_collect=20, gradient_steps=0)
-    before = len(pickle.dumps(model._terminations))
-    model.learn(200, reset_num_timesteps=False)
-    assert len(pickle.dumps(model._terminations)) <= before
 
 
 @pytest.mark.parametrize(
