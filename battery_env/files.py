@@ -6,6 +6,7 @@ import json
 import math
 import os
 import secrets
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -43,6 +44,8 @@ def replacing(path: str | os.PathLike[str], new: bool = False) -> Iterator[Path]
         yield part
         with part.open("rb+") as stream:
             os.fsync(stream.fileno())
+        if target.exists():  # what only its owner may read stays so
+            shutil.copymode(target, part)
         if new:
             _take_new_name(part, target)
         else:

@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +49,7 @@ from battery_env.loads import Load, RandomLoad, RandomPiecewise, constant
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import coloured
 from battery_env.policies.estimator import Predictor
-from battery_env.policies.pretrained import file_stem
+from battery_env.policies.pretrained import file_stem, write_card
 from battery_env.records import drawn
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
 from battery_env.records.model import RecordModel
@@ -64,7 +63,6 @@ from benchmarks.study import (
     new_panels,
     positive,
     versions,
-    write_json,
 )
 from benchmarks.training import Recipe, train_or_load, training_minutes
 from sb3_lac.onnx import export_onnx
@@ -355,7 +353,6 @@ def export(seeds: Sequence[int], folder: Path, command: str, scores: pd.DataFram
     card = {
         "env_id": ENV_ID,
         "options": {**OPTIONS, "path": path.to_mapping()},
-        "sha256": sha256(file.read_bytes()).hexdigest(),
         "algorithm": "LAC",
         "command": command,
         "recipe": {**asdict(recipes[0]), "seed": list(seeds)},
@@ -364,7 +361,7 @@ def export(seeds: Sequence[int], folder: Path, command: str, scores: pd.DataFram
         "training_minutes": sum(training_minutes(recipe, folder / "models") for recipe in recipes),
         "versions": versions(),
     }
-    write_json(file.with_suffix(".json"), card)
+    write_card(file, card)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

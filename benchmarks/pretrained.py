@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ import pandas as pd
 from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.policies.estimator import PolicyEstimator
-from battery_env.policies.pretrained import file_stem, policy_of_file
+from battery_env.policies.pretrained import file_stem, policy_of_file, write_card
 from battery_env.tasks.data import standard_dataset
 from benchmarks.contests import HELD_OUT, SENSORS
 from benchmarks.study import (
@@ -44,7 +43,6 @@ from benchmarks.study import (
     positive,
     row_by_row,
     versions,
-    write_json,
 )
 from benchmarks.training import Recipe, train_or_load, training_minutes
 from sb3_lac.onnx import export_onnx
@@ -80,7 +78,7 @@ def make(env_id: str, seed: int, updates: int, recorded: bool, folder: Path) -> 
     file = folder / f"{file_stem(env_id, recorded)}.onnx"
     with replacing(file) as part:
         export_onnx(model, part, env_id)
-    write_json(file.with_suffix(".json"), {"env_id": env_id, "options": OPTIONS})
+    write_card(file, {"env_id": env_id, "options": OPTIONS})
     return recipe
 
 
@@ -115,13 +113,12 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, file: Path) -> dict[str, Any]:
+def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, minutes: float) -> dict[str, Any]:
     """What a policy says of itself."""
     wander_V = recipe.hyperparameters["env_kwargs"].get("process_noise_V", 0.0)
     return {
         "env_id": recipe.env_id,
         "options": OPTIONS,
-        "sha256": sha256(file.read_bytes()).hexdigest(),
         "algorithm": "LAC",
         "command": command,
         "recipe": asdict(recipe),
@@ -130,7 +127,7 @@ def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, file: Path) -> d
             f"factors with a relative standard deviation of {MISMATCH:g}, 1 to 30 mV of noise and an offset within 10 mV"
             + (f", and noise of {1e3 * wander_V:g} mV per root of a second on Vo, Vsn and Vsp" if wander_V else "")
         ),
-        "training_minutes": training_minutes(recipe, file.parent / "models"),
+        "training_minutes": minutes,
         "scores": scores.drop(columns="env_id").round(4).to_dict("records"),
         "versions": versions(),
     }
@@ -179,7 +176,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = summary(scores)
     for env_id, recipe in recipes.items():
         own, stem = table[table["env_id"] == env_id], file_stem(env_id, chosen.recorded)
-        write_json(study.out / f"{stem}.json", card_of(recipe, own, study.command, study.out / f"{stem}.onnx"))
+        file = study.out / f"{stem}.onnx"
+        write_card(file, card_of(recipe, own, study.command, training_minutes(recipe, study.out / "models")))
     study.write({"pretrained": scores, "pretrained_summary": table}, {}, shown(table))
 
 

@@ -1,11 +1,8 @@
 """
 Train a policy for cells that age as a cell of your own did: on simulations along its recorded life. Some minutes.
 
-It writes ``mine.onnx`` and its options ``mine.json``, for ``battery-calibrate --method policy --policy mine.onnx``.
+It writes ``mine.onnx`` and ``path.json``, for ``PolicyEstimator(OnnxPolicy("mine.onnx"), ..., path="path.json")``.
 """
-
-import json
-from pathlib import Path
 
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecMonitor
@@ -48,4 +45,4 @@ calibrator = PolicyEstimator(model, "BatteryVoltageJoint-v0", path=path, reading
 print(calibrator.estimate(load_nasa_discharges("B0006")[60].loaded_part(cut_off_V=2.7)))
 
 export_onnx(model, "mine.onnx")
-Path("mine.json").write_text(json.dumps({"options": {"reading_s": reading_s, "path": path.to_mapping()}}), encoding="utf-8")
+path.to_json("path.json")

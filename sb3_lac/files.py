@@ -2,6 +2,7 @@
 
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +23,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield part
         with part.open("rb+") as stream:
             os.fsync(stream.fileno())
+        if target.exists():  # what only its owner may read stays so
+            shutil.copymode(target, part)
         os.replace(part, target)
         # Some systems cannot bring the name to the disk, and the file is whole all the same
         with suppress(OSError):

@@ -14,7 +14,7 @@ import pytest
 
 import battery_env
 from battery_env.__main__ import calibrate
-from battery_env.compiled import forget_outdated
+from battery_env.compiled import digest_of_kernels, forget_outdated
 
 ROOT = Path(__file__).parents[1]
 
@@ -135,13 +135,49 @@ def test_kernels_are_compiled_where_there_is_no_place_to_keep_them():
     assert result.stdout == "0.0\n" and not result.stderr
 
 
-def test_kernels_are_forgotten_when_a_module_that_they_may_call_has_changed(tmp_path):
-    (tmp_path / "lab").mkdir()
-    for number, name in enumerate(("a.py", "old.nbi", "b.py", "new.nbi", "lab/c.py")):
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (number, number))
-    forget_outdated(tmp_path)
-    assert {path.name for path in tmp_path.glob("*.nbi")} == {"new.nbi"}
+def test_kernels_are_those_of_the_code_that_they_may_call_whatever_its_date(tmp_path):
+    package = tmp_path / "battery_env"
+    package.mkdir()
+    kernels, numbers, plots = (package / name for name in ("kernels.py", "numbers.py", "plots.py"))
+    kernels.write_text("from battery_env.compiled import compiled\nfrom battery_env.numbers import (\n    N,\n)\n")
+    numbers.write_text("N = 1\n")
+    plots.write_text("from battery_env.kernels import N\n")
+
+    def digest():
+        digest_of_kernels.cache_clear()
+        return digest_of_kernels(package)
+
+    first = digest()
+    plots.write_text("")
+    for path in (kernels, numbers, plots):
+        os.utime(path, (9e9, 9e9))  # a wrong clock
+    assert digest() == first
+    numbers.write_text("N = 2\n")
+    assert digest() not in (first, None)
+    digest_of_kernels.cache_clear()
+
+
+def test_kernels_of_other_code_are_forgotten_and_those_of_this_one_stay(tmp_path):
+    for digest, stays in (("a", False), ("a", True), ("b", False)):
+        (tmp_path / "kept.nbi").touch()
+        forget_outdated.cache_clear()
+        forget_outdated(tmp_path, digest)
+        assert (tmp_path / "kept.nbi").exists() == stays
+    forget_outdated.cache_clear()
+
+
+def test_whoever_waits_for_the_first_compilation_is_told(tmp_path):
+    code = (
+        "from battery_env.compiled import saying_that_it_compiles\nfrom battery_env.electrochemistry import kernels\n"
+        "with saying_that_it_compiles():\n    kernels.logarithm(1.0), kernels.logarithm(2)\n"
+    )
+    said = []
+    for _ in range(2):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+        result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
+        assert result.returncode == 0 and not result.stdout
+        said.append(result.stderr)
+    assert said == ["compiling, once after an installation or update: half a minute\n", ""]
 
 
 def test_every_public_name_of_battery_env_is_the_one_that_type_checkers_see():

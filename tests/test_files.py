@@ -1,6 +1,7 @@
 """A file is there as a whole, the old one or the new one, whichever write, sync or renaming fails. Also of two writers."""
 
 import json
+import os
 import threading
 
 import numpy as np
@@ -110,6 +111,20 @@ def test_whichever_write_sync_or_renaming_fails_the_file_is_whole(name, tmp_path
         Disk(patch, 2 if replaces else 1)
         write(NEW, path)
     check_whole(failed=False)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="modes of files are those of POSIX")
+@pytest.mark.parametrize("package", [battery_env.files, sb3_lac.files], ids=["battery_env", "sb3_lac"])
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o664])
+def test_who_may_read_a_file_stays_as_it_was(package, mode, tmp_path):
+    path, link = tmp_path / "state.bin", tmp_path / "link.bin"
+    path.write_bytes(b"old")
+    path.chmod(mode)
+    link.symlink_to(path)
+    for name in (path, link):
+        with package.replacing(name) as part:
+            part.write_bytes(b"new")
+        assert path.read_bytes() == b"new" and path.stat().st_mode & 0o777 == mode
 
 
 @pytest.mark.parametrize("package", [battery_env.files, sb3_lac.files], ids=["battery_env", "sb3_lac"])

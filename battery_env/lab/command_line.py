@@ -18,14 +18,13 @@ from contextlib import contextmanager
 from dataclasses import asdict, fields
 from difflib import get_close_matches
 from functools import wraps
-from hashlib import sha256
 from importlib.resources import files
 from importlib.util import find_spec
 from itertools import chain, islice
 from pathlib import Path
-from threading import Timer
 from typing import Any, Literal, ParamSpec
 
+from battery_env.compiled import saying_that_it_compiles
 from battery_env.estimators.cell_fit import CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.estimators.joint_fit import fit_cell
@@ -48,8 +47,6 @@ SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141
 _VERSION = files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
 _INSTALLED = "battery-calibrate"
 
-# What lasts longer than this compiles, s.
-_PATIENCE_S = 5.0
 # So many discharges fit beside each other in the figure of a fit.
 _MOST_SHOWN = 4
 
@@ -128,14 +125,8 @@ _SIGN: _Options = {
 _CALIBRATION: _Options = {
     ("--method",): {
         "choices": METHODS,
-        "help": "of calibration: least squares, the filter (kalman), or a policy trained on simulated cells (default: least "
-        "squares; the filter where these do not settle one in progress at a constant load, without --prior and --cell)",
-    },
-    ("--policy",): {
-        "type": Path,
-        "metavar": "FILE.onnx",
-        "help": "what --method policy follows, with the constants of --cell if it was trained with them (default: the "
-        "policy that comes with the package, which has learned on a new 18650)",
+        "help": "of calibration: least squares, the filter (kalman), or the policy that comes with the package (default: "
+        "least squares; the filter where these do not settle one in progress at a constant load, without --prior and --cell)",
     },
     ("--parameters",): {
         "nargs": "+",
@@ -394,8 +385,6 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) ->
     if options.out is None:
         return _calibrate(sources, settings, file_format, options, None)
     made_with = {"battery_env": _VERSION, **asdict(settings), **asdict(file_format), "voltages": not options.table_only}
-    if settings.policy is not None:
-        made_with["policy"] = sha256(settings.policy.read_bytes()).hexdigest()
     results = Results(options.out, sources, not options.table_only, settings, made_with)
     with results.opened(options.force):
         return _calibrate(sources, settings, file_format, options, results)
@@ -416,7 +405,7 @@ def _calibrate(
         with workers(options.jobs, options.scheduler) as executor:
             ahead = 64 if options.scheduler or options.jobs == -1 else 2 * options.jobs
             outcomes = calibrate_all(sources, file_format, settings, results, executor, ahead)
-            with _waiting():
+            with saying_that_it_compiles():
                 first = list(islice(outcomes, 1))
             for outcome in chain(first, outcomes):
                 done.append(outcome)
@@ -472,7 +461,7 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
     check_new(out, picture)
     discharges = _discharges(options.records, _file_format(options))
     print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
-    with warnings.catch_warnings(), _waiting():
+    with warnings.catch_warnings(), saying_that_it_compiles():
         warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
         found = fit_cell(discharges, options.cut_off, thermal=not options.isothermal)
     print(found.summary())
@@ -498,7 +487,7 @@ def forecast(arguments: Sequence[str] | None = None, name: str = "python -m batt
     if options.life and settings.prior_q_mobile_C is not None:
         raise ValueError("--life and --prior say the same: give one of them")
     files = EndFiles(options.out, options.record) if options.out else None
-    with _saying(), _waiting():
+    with _saying(), saying_that_it_compiles():
         end = end_of_record(options.record, settings, file_format, options.life, options.load)
     print(json.dumps(end.row()) if options.json else end.text())
     if files:
@@ -532,19 +521,6 @@ _OTHERS: dict[str, tuple[Callable[..., int], str]] = {
     "fit": (fit, "the constants of a cell from a few of its discharges"),
     "page": (page, "all of it as a page in the browser"),
 }
-
-
-@contextmanager
-def _waiting() -> Iterator[None]:
-    """Says at a terminal, where the first call after an installation compiles, that it does."""
-    text = "compiling, once after an installation: half a minute"
-    timer = Timer(_PATIENCE_S, print, [text], {"file": sys.stderr, "flush": True})
-    if sys.stderr.isatty():
-        timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def _coloured(text: str, settled: bool) -> str:

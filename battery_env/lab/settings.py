@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -18,9 +17,8 @@ from battery_env.estimators.diagnosis.conditions import Condition
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.kalman.filter import PRIOR_SD_SHARE_Q, ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, check_parameters
+from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE
 from battery_env.policies.estimator import PolicyEstimator
-from battery_env.policies.pretrained import policy_of_file
 from battery_env.records import CUT_OFF_V
 
 Method = Literal["least-squares", "kalman", "policy"]
@@ -30,10 +28,11 @@ METHODS: tuple[Method, ...] = get_args(Method)
 # estimate within this ratio.
 _SAME_LOAD = 1.25
 _AMBIENT_LIMITS_C = (-60.0, 100.0)
-# Policies that come with the package, by what they find alone.
-_PRETRAINED: dict[tuple[str, ...], str] = {("q_mobile",): "BatteryVoltageQmax-v0", ("r_o",): "BatteryVoltageRo-v0"}
-# What a policy cannot be told: it has learned on one model.
-_NOT_FOR_POLICIES = ("prior_q_mobile_C", "mismatch_V", "current_gain_sd", "ambient_C", "q_mobile_bounds_C", "initial_soc")
+# What the policy that comes with the package cannot be told: it has learned on a new 18650, of which it finds both.
+_NOT_FOR_POLICIES = (
+    *("cell", "parameters", "prior_q_mobile_C", "mismatch_V", "current_gain_sd", "ambient_C", "q_mobile_bounds_C"),
+    "initial_soc",
+)
 
 # Nor may be said beside a path: it tells which of all go together, at the temperature of its lives.
 _NOT_WITH_PATH = ("parameters", "ambient_C")
@@ -70,8 +69,6 @@ class Settings:
     :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: told from the voltage of the rest before the load, of a minute at least
-    :param policy: ONNX file of the policy that the method ``"policy"`` follows; ``None``: the one that comes with the package.
-        Its model is at constant temperature, the new cell's or, of a policy of the user's own, ``cell``; and it takes no prior
     :raises ValueError: for an argument out of range, and for what a policy cannot be told. What the calibrators refuse they
         refuse when :meth:`calibrator` makes them
     """
@@ -93,7 +90,6 @@ class Settings:
     path: AgingPath | None = None
     q_mobile_bounds_C: tuple[float, float] | None = None
     initial_soc: InitialSoc | Literal["rest"] = 1.0
-    policy: Path | None = None
 
     def __post_init__(self) -> None:
         if self.method not in (None, *METHODS):
@@ -114,19 +110,13 @@ class Settings:
                 raise ValueError("a path of aging cells comes with its constants: take Settings.for_cell(path)")
             self._refuse_stated(_NOT_WITH_PATH, "a path of aging cells", "leave the path out")
         if self.method == "policy":
-            self._refuse_stated(_NOT_FOR_POLICIES, "a policy", "take another method")
-            if self.cell is not None and self.policy is None:
-                raise ValueError(
-                    "the policy that comes with the package takes no cell: it has learned on a new 18650. Take another "
-                    "method, or a policy of your own that was trained with these constants"
-                )
-        elif self.policy is not None:
-            raise ValueError(f"a policy is for the method policy, got {self.method!r}")
+            self._refuse_stated(_NOT_FOR_POLICIES, "the policy that comes with the package", "take another method")
 
     def _refuse_stated(self, names: tuple[str, ...], what: str, other: str) -> None:
-        for field in fields(self):
-            if field.name in names and getattr(self, field.name) != field.default:
-                raise ValueError(f"{what} takes no {field.name}: leave it out, or {other}")
+        defaults = {field.name: field.default for field in fields(self)}
+        for name in names:
+            if getattr(self, name) != defaults[name]:
+                raise ValueError(f"{what} takes no {name}: leave it out, or {other}")
 
     @classmethod
     def for_cell(cls, cell: CellFit | AgingPath | CellParameters | None = None, **others: Any) -> Settings:
@@ -137,16 +127,15 @@ class Settings:
         :param others: further settings, which replace what the fit knows
         """
         if isinstance(cell, CellFit):
-            known: dict[str, Any] = {"cut_off_V": cell.cell.VEOD}
-            if others.get("method") != "policy":
-                known |= {
-                    "mismatch_V": cell.mismatch_V,
-                    "thermal": cell.thermal,
-                    "cell_currents_A": cell.currents_A,
-                    "cell_q_mobile_C": cell.life_q_mobile_C,
-                    "q_mobile_bounds_C": cell.q_mobile_bounds_C,
-                    "cell_sd_r_o_ohm": cell.sd_r_o_ohm,
-                }
+            known: dict[str, Any] = {
+                "cut_off_V": cell.cell.VEOD,
+                "mismatch_V": cell.mismatch_V,
+                "thermal": cell.thermal,
+                "cell_currents_A": cell.currents_A,
+                "cell_q_mobile_C": cell.life_q_mobile_C,
+                "q_mobile_bounds_C": cell.q_mobile_bounds_C,
+                "cell_sd_r_o_ohm": cell.sd_r_o_ohm,
+            }
             others, cell = {**known, **others}, cell.cell
         elif isinstance(cell, AgingPath):
             known = {"cut_off_V": cell.cell.VEOD, "mismatch_V": cell.mismatch_V, "thermal": False, "path": cell}
@@ -182,14 +171,14 @@ class Settings:
         self, cell: CellParameters | None = None, start: Start | None = None
     ) -> LeastSquares | ExtendedKalmanFilter | PolicyEstimator:
         """
-        The calibrator that is asked for. It refuses options that it cannot use, and a policy that does not suit them.
+        The calibrator that is asked for. It refuses options that it cannot use.
 
         :param cell: constants of the model at the temperature of a discharge; ``None``: those of the settings
         :param start: how the discharge starts; ``None``: as the settings say
-        :raises ValueError: for an option out of range, or a policy of another cell or of other parameters
+        :raises ValueError: for an option out of range
         """
         if self.method == "policy":
-            return self._policy()
+            return PolicyEstimator.pretrained(recorded=True)
         calibrator = ExtendedKalmanFilter if self.method == "kalman" else partial(LeastSquares, path=self.path)
         stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
         return calibrator(
@@ -204,25 +193,7 @@ class Settings:
             q_mobile_bounds_C=Q_MOBILE.limits if self.q_mobile_bounds_C is None else self.q_mobile_bounds_C,
         )
 
-    def _policy(self) -> PolicyEstimator:
-        if self.policy is None:
-            env_id = _PRETRAINED.get(check_parameters(self.parameters), "BatteryVoltageJoint-v0")
-            return PolicyEstimator.pretrained(env_id, recorded=True)
-        policy, options = policy_of_file(self.policy)
-        if options.get("cell") != self.cell:
-            learned = "a new 18650, or the file beside it does not say on which constants ('cell' of its 'options')"
-            if "cell" in options:
-                learned = "the constants of a cell, which are others: give its cell (--cell)"
-            raise ValueError(f"{self.policy} has learned on {learned}")
-        estimator = PolicyEstimator(policy, policy.env_id, **options)
-        if set(estimator.parameters) != set(self.parameters):
-            asked, found = " and ".join(self.parameters), " and ".join(estimator.parameters)
-            raise ValueError(f"{self.policy} is a policy of {policy.env_id}, which finds {found}, not {asked}")
-        return estimator
-
     @property
     def calibrated_by(self) -> str:
         """The calibrator, for readers."""
-        if self.method != "policy":
-            return self.method or "least-squares"
-        return "the policy that comes with the package" if self.policy is None else f"the policy of {self.policy}"
+        return "the policy that comes with the package" if self.method == "policy" else self.method or "least-squares"

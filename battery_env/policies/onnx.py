@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from hashlib import sha256
 from pathlib import Path
@@ -24,7 +25,8 @@ class OnnxPolicy:
       policy = OnnxPolicy("voltage_joint.onnx")
       estimator = PolicyEstimator(policy, policy.env_id)
 
-    ``sb3_lac.onnx.export_onnx`` writes such files, of any algorithm of Stable-Baselines3, with a checksum, which is compared.
+    ``sb3_lac.onnx.export_onnx`` writes such files, of any algorithm of Stable-Baselines3, with a checksum, which is compared,
+    as is ``sha256`` of the card of a policy, a JSON file of the same name beside it.
     Needs the extra ``battery_env[onnx]``.
 
     :param path: an ONNX file with one float32 input of shape (n, ...) and one output of actions of shape (n, ...)
@@ -47,6 +49,11 @@ class OnnxPolicy:
         checksum = _CHECKSUM.search(content[-128:])
         if checksum and checksum[1].decode() != sha256(content[: -len(checksum[0])]).hexdigest():
             raise ValueError(f"{path} is damaged: its checksum is wrong")
+        #: Of the file, which no other policy has
+        self.sha256: str = sha256(content).hexdigest()
+        card = path.with_suffix(".json")
+        if self.sha256 != _stated_sha256(card, self.sha256):
+            raise ValueError(f"{path} is damaged, or not the policy that {card} is of: its sha256 is {self.sha256}")
         try:
             self._session = InferenceSession(content, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises whatever the damage leads it to
@@ -55,8 +62,6 @@ class OnnxPolicy:
         if len(inputs) != 1 or len(outputs) != 1:
             raise ValueError(f"{path} must have one input and one output, it has {len(inputs)} and {len(outputs)}")
         self._input = inputs[0].name
-        #: Of the file, which no other policy has
-        self.sha256: str = sha256(content).hexdigest()
         #: What the file says of itself, e.g. ``algorithm`` and ``env_id``
         self.description: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
         #: Shape of one observation
@@ -83,6 +88,16 @@ class OnnxPolicy:
             raise ValueError("deterministic must be True: an ONNX file holds the deterministic policy only")
         observation = np.asarray(observation, dtype=np.float32)
         if observation.shape[1:] != self.observation_shape:
-            raise ValueError(f"observation must have shape (n, {self.observation_shape}), got {observation.shape}")
+            shape = ", ".join(map(str, self.observation_shape))
+            raise ValueError(f"observation must have shape (n, {shape}), got {observation.shape}")
         (action,) = self._session.run(None, {self._input: observation})
         return action, None
+
+
+def _stated_sha256(card: Path, otherwise: str) -> str:
+    """The digest of a policy by its card, if it has one that says it."""
+    try:
+        stated = json.loads(card.read_text(encoding="utf-8"))["sha256"]
+    except (OSError, ValueError, TypeError, LookupError):  # there is none, or a file that has to do with something else
+        return otherwise
+    return str(stated)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from hashlib import sha256
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
-from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
+from battery_env.files import replacing
 from battery_env.policies.onnx import OnnxPolicy
 
 _PACKAGE = "battery_env.policies.pretrained_policies"
@@ -36,45 +39,55 @@ def pretrained_card(env_id: str, recorded: bool = False) -> dict[str, Any]:
     :return: the JSON file beside the policy
     :raises ValueError: if none comes with the package
     """
-    _check(env_id)
-    card: dict[str, Any] = json.loads(
-        files(_PACKAGE).joinpath(f"{file_stem(env_id, recorded)}.json").read_text(encoding="utf-8")
-    )
-    return card
+    with _file(env_id, recorded) as file:
+        return _read_card(file)
 
 
 def pretrained_policy(env_id: str, recorded: bool = False) -> tuple[OnnxPolicy, dict[str, Any]]:
     """A policy that comes with the package, run by onnxruntime: no torch, and no pickle."""
-    _check(env_id)
-    with as_file(files(_PACKAGE)) as folder:
-        return policy_of_file(folder / f"{file_stem(env_id, recorded)}.onnx")
+    with _file(env_id, recorded) as file:
+        return policy_of_file(file)
 
 
-def policy_of_file(path: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
+def policy_of_file(file: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
     """
-    A policy from a file, with the options of its task from ``options`` of a JSON file of the same name beside it, if there is
-    one. The constants of a cell (``cell``) and a path of aging cells (``path``) are written there by name, and ``sha256`` of
-    the policy, where it is known.
+    A policy from a file, with the options of its task from its card.
 
-    :raises ValueError: if the policy is damaged, or not that of the other file
+    :raises ValueError: if either is damaged, or they do not belong together
     """
-    policy, card = OnnxPolicy(path), path.with_suffix(".json")
-    if not card.exists():
-        return policy, {}
-    try:
-        content = json.loads(card.read_text(encoding="utf-8"))
-        options, sha256 = dict(content["options"]), content.get("sha256", policy.sha256)
-        if "cell" in options:
-            options["cell"] = CellParameters.of_mapping(options["cell"])
-        if "path" in options:
-            options["path"] = AgingPath.of_mapping(options["path"])
-    except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"{card} has to be an object in JSON with the options of the task as 'options': {error!r}") from error
-    if policy.sha256 != sha256:
-        raise ValueError(f"{path} is damaged, or not the policy that {card} is of: its sha256 is {policy.sha256}")
+    policy, options = OnnxPolicy(file), dict(_read_card(file)["options"])
+    if "path" in options:
+        options["path"] = AgingPath.of_mapping(options["path"])
     return policy, options
 
 
-def _check(env_id: str) -> None:
+def write_card(file: Path, content: Mapping[str, Any]) -> None:
+    """Describe a policy in a JSON file of the same name beside it, with the checksums of both."""
+    card = {**content, "sha256": sha256(file.read_bytes()).hexdigest()}
+    with replacing(file.with_suffix(".json")) as part:
+        part.write_text(json.dumps({**card, "card_sha256": _digest(card)}, indent=2) + "\n", encoding="utf-8")
+
+
+def _read_card(file: Path) -> dict[str, Any]:
+    path = file.with_suffix(".json")
+    try:
+        card: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        is_whole = card.pop("card_sha256") == _digest(card)
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged, or no card of a policy: {error!r}") from error
+    if not is_whole:
+        raise ValueError(f"{path} is damaged: its checksum is wrong")
+    return card
+
+
+def _digest(card: Mapping[str, Any]) -> str:
+    return sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()
+
+
+@contextmanager
+def _file(env_id: str, recorded: bool) -> Iterator[Path]:
+    """A policy that comes with the package, in a folder with its card."""
     if env_id not in pretrained_ids():
         raise ValueError(f"no policy for {env_id!r} comes with the package: there are {', '.join(pretrained_ids()) or 'none'}")
+    with as_file(files(_PACKAGE)) as folder:
+        yield folder / f"{file_stem(env_id, recorded)}.onnx"

@@ -3,13 +3,12 @@
 import dataclasses
 import json
 import warnings
-from importlib.resources import files
 
 import numpy as np
 import pytest
 from numpy.polynomial import Legendre
 
-from battery_env import CellParameters, ExtendedKalmanFilter, LeastSquares, OnnxPolicy, PolicyEstimator, fit_cell, forecast
+from battery_env import CellParameters, ExtendedKalmanFilter, LeastSquares, fit_cell, forecast
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
@@ -19,7 +18,6 @@ from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.loads import constant as constant_load
-from battery_env.policies.pretrained import pretrained_card
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 
 FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
@@ -236,27 +234,6 @@ class TestFiles:
         for value, name in ((fit, "fit.json"), (OTHER, "constants.json")):
             with pytest.raises(FileExistsError, match="exists already"):
                 value.to_json(tmp_path / name)
-
-    def test_a_policy_of_ones_own_takes_the_constants_and_the_cut_off_of_a_fit(self, fit, tmp_path):
-        policy, card = tmp_path / "mine.onnx", pretrained_card("BatteryVoltageJoint-v0")
-        policy.write_bytes(
-            files("battery_env.policies.pretrained_policies").joinpath("BatteryVoltageJoint-v0.onnx").read_bytes()
-        )
-        policy.with_suffix(".json").write_text(json.dumps({"options": card["options"]}))
-        with pytest.raises(ValueError, match=r"mine\.onnx has learned on a new 18650, or the file beside it does not say"):
-            Settings.for_cell(fit, method="policy", policy=policy).calibrator()
-        options = {**card["options"], "cell": dataclasses.asdict(fit.cell)}
-        policy.with_suffix(".json").write_text(json.dumps({"options": options}))
-        for cell in ({}, {"cell": OTHER}):
-            with pytest.raises(ValueError, match=r"mine\.onnx has learned on the constants of a cell, which are others"):
-                Settings(method="policy", policy=policy, **cell).calibrator()
-        settings = Settings.for_cell(fit, method="policy", policy=policy)
-        record = discharged(fit.cell, 6000.0, 0.15, pulses(7)).loaded_part(fit.cell.VEOD)
-        row = calibrate(record, settings).row()
-        own = PolicyEstimator(OnnxPolicy(policy), "BatteryVoltageJoint-v0", cell=fit.cell, **card["options"])
-        assert settings.cut_off_V == fit.cell.VEOD
-        assert row["q_mobile_C"] == own.estimate(record).q_mobile != PolicyEstimator.pretrained().estimate(record).q_mobile
-        assert row["q_mobile_C"] == pytest.approx(6000.0, rel=0.05)
 
     def test_constants_hold_for_the_loads_that_were_fitted(self, fit):
         low_A, high_A = fit.currents_A

@@ -3,7 +3,6 @@ import subprocess
 import sys
 from contextlib import redirect_stdout
 from dataclasses import replace
-from importlib.resources import files
 from io import StringIO
 from pathlib import Path
 
@@ -265,10 +264,9 @@ POLICY = ["B0005:100", "--method", "policy"]
         (["B0005:1", "--future-current", "-2"], "future_current_A must be finite and at least 0, got -2.0"),
         (["B0005:1", "--nominal", "0"], "the nominal capacity in Ah must be a positive, finite number, got 0.0"),
         (["B0005:1", "--ambient", "297"], "the ambient temperature must lie within -60 .. 100 degC, got 297.0"),
-        ([*POLICY, "--prior", "5000", "50"], "a policy takes no prior_q_mobile_C"),
-        ([*POLICY, "--initial-soc", "0.8"], "a policy takes no initial_soc"),
-        ([*POLICY, "--policy", "none.onnx"], "none.onnx"),
-        (["B0005:1", "--method", "kalman", "--policy", "mine.onnx"], "a policy is for the method policy, got 'kalman'"),
+        ([*POLICY, "--prior", "5000", "50"], "the policy that comes with the package takes no prior_q_mobile_C"),
+        ([*POLICY, "--initial-soc", "0.8"], "the policy that comes with the package takes no initial_soc"),
+        ([*POLICY, "--parameters", "r_o"], "the policy that comes with the package takes no parameters"),
     ],
 )
 def test_bad_input_is_one_line_and_no_traceback(arguments, message, lab, recorded, tmp_path, monkeypatch, terminal):
@@ -543,12 +541,3 @@ class TestPolicies:
         record = load_nasa_discharges("B0005")[99].loaded_part(2.7)
         assert row["q_mobile_C"] == pytest.approx(PolicyEstimator.pretrained(recorded=True).estimate(record).q_mobile)
         assert row["method"] == "policy" and row["sd_q_mobile_C"] < 100.0 and row["settled"]
-
-    def test_one_of_a_file_takes_its_place(self, tmp_path, terminal):
-        file = tmp_path / "mine.onnx"
-        for suffix in (".onnx", ".json"):
-            content = files("battery_env.policies.pretrained_policies").joinpath(f"BatteryVoltageQmax-v0{suffix}").read_bytes()
-            file.with_suffix(suffix).write_bytes(content)
-        arguments = (*POLICY, "--policy", file)
-        assert f"calibrated by the policy of {file}" in terminal.shows(*arguments, "--parameters", "q_mobile", status=3)
-        assert "a policy of BatteryVoltageQmax-v0, which finds q_mobile, not q_mobile and r_o" in terminal.refuses(*arguments)

@@ -1,10 +1,8 @@
 """The policies that come with the package."""
 
 import hashlib
-import json
 import subprocess
 import sys
-from dataclasses import asdict
 from importlib.resources import files
 from itertools import product
 
@@ -12,10 +10,10 @@ import numpy as np
 import pytest
 
 from battery_env import (
-    NEW_CELL,
     AgingPath,
     Discharge,
     LeastSquares,
+    OnnxPolicy,
     PolicyEstimator,
     SensorErrors,
     TrajectoryDataset,
@@ -23,9 +21,10 @@ from battery_env import (
     evaluate,
     load_nasa_discharges,
 )
+from battery_env.__main__ import main
 from battery_env.estimates import last_estimate
 from battery_env.loads import Load
-from battery_env.policies.pretrained import file_stem, policy_of_file, pretrained_card, pretrained_policy
+from battery_env.policies.pretrained import file_stem, pretrained_card, pretrained_policy
 from battery_env.records.discharge import BUNDLED_CELLS
 from battery_env.tasks.data import standard_dataset
 
@@ -134,31 +133,59 @@ def test_without_onnxruntime_the_error_names_the_extra(monkeypatch):
         PolicyEstimator.pretrained()
 
 
-class TestFiles:
+class TestDamage:
     @pytest.fixture
-    def copy(self, tmp_path):
-        path = tmp_path / "mine.onnx"
-        path.write_bytes(FOLDER.joinpath("BatteryVoltageRo-v0.onnx").read_bytes())
-        return path
+    def copies(self, tmp_path, monkeypatch):
+        """The folder of the policies that come with the package, in a place where they may be damaged."""
+        for file in FOLDER.iterdir():
+            if file.name.endswith((".onnx", ".json")):
+                (tmp_path / file.name).write_bytes(file.read_bytes())
+        monkeypatch.setattr("battery_env.policies.pretrained.files", lambda _: tmp_path)
+        return tmp_path
 
-    def test_a_card_says_the_options_and_the_constants(self, copy):
-        policy, options = policy_of_file(copy)
-        assert options == {} and policy.env_id == "BatteryVoltageRo-v0"
-        cell = NEW_CELL.replace(kn=1000.0)
-        copy.with_suffix(".json").write_text(json.dumps({"options": {"reading_s": 5.0, "cell": asdict(cell)}}))
-        assert policy_of_file(copy)[1] == {"reading_s": 5.0, "cell": cell}
+    @pytest.mark.parametrize("recorded", [False, True])
+    @pytest.mark.parametrize("env_id", IDS)
+    @pytest.mark.parametrize("suffix", [".onnx", ".json"])
+    def test_a_flipped_bit_is_refused_by_every_door(self, suffix, env_id, recorded, copies):
+        policy = copies / f"{file_stem(env_id, recorded)}.onnx"
+        file, rng = policy.with_suffix(suffix), np.random.default_rng(0)
+        whole, sha256 = file.read_bytes(), OnnxPolicy(policy).sha256
+        doors = [
+            lambda: pretrained_policy(env_id, recorded),
+            lambda: PolicyEstimator.pretrained(env_id, recorded=recorded),
+            lambda: pretrained_card(env_id, recorded) if suffix == ".json" else OnnxPolicy(policy),
+        ]
+        for place in (*rng.integers(len(whole), size=40), 0, len(whole) - 2):
+            content = bytearray(whole)
+            content[place] ^= 1 << rng.integers(8)
+            file.write_bytes(content)
+            for door in doors:
+                with pytest.raises(ValueError, match=f"{policy.stem}.* is damaged"):
+                    door()
+            if suffix == ".json":  # which the policy itself asks for nothing but a checksum
+                try:
+                    assert OnnxPolicy(policy).sha256 == sha256
+                except ValueError as error:
+                    assert "is damaged, or not the policy" in str(error)
 
-    def test_a_policy_that_its_card_is_not_of_is_refused(self, copy):
-        copy.with_suffix(".json").write_text(FOLDER.joinpath("BatteryVoltageRo-v0.json").read_text())
-        content = bytearray(copy.read_bytes())
-        assert policy_of_file(copy)[1]["reading_s"] == 2.0
-        content[content.index(b"BatteryVoltageRo")] ^= 1
-        copy.write_bytes(content)
-        with pytest.raises(ValueError, match=r"mine\.onnx is damaged, or not the policy that .*mine\.json is of"):
-            policy_of_file(copy)
+    def test_the_command_refuses_them_too(self, copies, capsys):
+        for path in copies.glob("*.onnx"):
+            content = bytearray(path.read_bytes())
+            content[len(content) // 2] ^= 4
+            path.write_bytes(content)
+        assert main(["calibrate", "B0005:100", "--method", "policy"]) == 2
+        assert "is damaged" in capsys.readouterr().err
 
-    @pytest.mark.parametrize("text", ["{", "[]", "{}", "null", '{"options": 3}', '{"options": {"cell": {"kn": 1000.0}}}'])
-    def test_a_card_that_is_none_is_refused(self, copy, text):
-        copy.with_suffix(".json").write_text(text)
-        with pytest.raises(ValueError, match="has to be an object in JSON with the options of the task"):
-            policy_of_file(copy)
+    @pytest.mark.parametrize("text", ["{", "[]", "{}", "null", '{"sha256": 3}'[:-1], '{"options": {}}'])
+    def test_a_file_of_the_same_name_that_is_no_card_is_none_of_its_business(self, copies, text):
+        policy = copies / "BatteryVoltageJoint-v0.onnx"
+        policy.with_suffix(".json").write_text(text)
+        assert OnnxPolicy(policy).env_id == "BatteryVoltageJoint-v0"
+        with pytest.raises(ValueError, match=r"BatteryVoltageJoint-v0\.json is damaged, or no card of a policy"):
+            pretrained_policy("BatteryVoltageJoint-v0")
+
+
+def test_an_observation_of_another_shape_is_refused():
+    policy, _ = pretrained_policy("BatteryVoltageJoint-v0")
+    with pytest.raises(ValueError, match=r"observation must have shape \(n, 114\), got \(2, 3\)"):
+        policy.predict(np.zeros((2, 3)))
