@@ -21,7 +21,6 @@ if TYPE_CHECKING:
         ClosedForm,
         Estimator,
         ExtendedKalmanFilter,
-        GreedyOneStep,
         LeastSquares,
         cramer_rao_bound,
         fit_cell,
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     )
     from battery_env.evaluation import evaluate
     from battery_env.lab.calibrate import calibrate
-    from battery_env.lab.conversions import capacity_Ah, dc_resistance_ohm
     from battery_env.lab.forecast import Forecast, forecast
     from battery_env.lab.life import Life, track_life
     from battery_env.lab.readers.discharges import read_discharge_csv, read_discharges
@@ -50,12 +48,11 @@ _MODULES = {
     "electrochemistry.aging_path": ("AgingPath",),
     "estimates": ("Estimate",),
     "estimators": (
-        *("CellFit", "ClosedForm", "Estimator", "ExtendedKalmanFilter", "GreedyOneStep", "LeastSquares"),
+        *("CellFit", "ClosedForm", "Estimator", "ExtendedKalmanFilter", "LeastSquares"),
         *("cramer_rao_bound", "fit_cell", "fit_life", "soc_from_rest"),
     ),
     "evaluation": ("evaluate",),
     "lab.calibrate": ("calibrate",),
-    "lab.conversions": ("capacity_Ah", "dc_resistance_ohm"),
     "lab.forecast": ("Forecast", "forecast"),
     "lab.life": ("Life", "track_life"),
     "lab.readers.discharges": ("read_discharge_csv", "read_discharges"),

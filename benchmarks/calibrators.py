@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS
-from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, GreedyOneStep, LeastSquares
+from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, LeastSquares
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES
@@ -38,6 +38,7 @@ from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.contests import HELD_OUT, SENSORS
+from benchmarks.greedy import GreedyOneStep
 from benchmarks.pretrained import OPTIONS
 from benchmarks.study import (
     SYMBOLS,

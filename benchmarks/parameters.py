@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from battery_env import Estimate
 from battery_env.estimators import ExtendedKalmanFilter, LeastSquares
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
-from battery_env.lab.conversions import capacity_Ah, dc_resistance_ohm
+from battery_env.loads import constant
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.records.model import RecordModel
 from benchmarks.study import Study, Tables, command_line, markdown, positive
@@ -47,16 +48,33 @@ def measure(discharge: Discharge) -> dict[str, Any]:
     row |= {"load_A": load_A, "pulse_ohm": (record.voltage_V[0] - pulse_V) / load_A, "capacity_Ah": record.charge_C / 3600.0}
     for name, method in _METHODS.items():
         estimate = method.estimate(record)
-        pulse = dc_resistance_ohm(estimate, load_A, PULSE_S, 1.0, model=_MODEL)
+        pulse, sd_pulse = pulse_ohm(estimate, load_A)
         row |= {f"{name}_r_o_ohm": estimate.r_o, f"{name}_sd_r_o_ohm": estimate.sd_r_o}
-        row |= {f"{name}_pulse_ohm": pulse.value, f"{name}_sd_pulse_ohm": pulse.sd}
+        row |= {f"{name}_pulse_ohm": pulse, f"{name}_sd_pulse_ohm": sd_pulse}
         if name == "least_squares":
             for cut_off_V in OTHER_CUT_OFFS_V:
-                found = capacity_Ah(estimate, load_A, cut_off_V, model=_MODEL)
+                found, sd = capacity_Ah(estimate, load_A, cut_off_V)
                 measured_Ah = discharge.loaded_part(cut_off_V).charge_C / 3600.0
-                row |= {f"error_to_{cut_off_V:g}_V_percent": 100.0 * (found.value / measured_Ah - 1.0)}
-                row |= {f"sd_to_{cut_off_V:g}_V_percent": 100.0 * found.sd / measured_Ah}
+                row |= {f"error_to_{cut_off_V:g}_V_percent": 100.0 * (found / measured_Ah - 1.0)}
+                row |= {f"sd_to_{cut_off_V:g}_V_percent": 100.0 * sd / measured_Ah}
     return row
+
+
+def capacity_Ah(estimate: Estimate, load_A: float, cut_off_V: float) -> tuple[float, float]:
+    """What a cell of this estimate gives from full down to a cut-off, and its standard deviation to first order."""
+    step_C, step_ohm = 0.01 * estimate.q_mobile, 0.002
+    q_mobile = estimate.q_mobile + step_C * np.array([0.0, -1.0, 1.0, 0.0])
+    r_o = estimate.r_o + np.array([0.0, 0.0, 0.0, step_ohm])
+    value, less, more, of_r = _MODEL.capacity_Ah([constant(load_A, "current")], cut_off_V, q_mobile, r_o).tolist()
+    by_q, by_r = (more - less) / (2.0 * step_C), (of_r - value) / step_ohm
+    return value, float(np.hypot(by_q * estimate.sd_q_mobile, by_r * estimate.sd_r_o))
+
+
+def pulse_ohm(estimate: Estimate, current_A: float) -> tuple[float, float]:
+    """The fall of its voltage within ``PULSE_S`` from full charge, over the current, and its standard deviation."""
+    columns = _MODEL.sensitivities(np.full(int(PULSE_S) + 1, current_A), estimate.q_mobile, estimate.r_o)
+    value, by_q, by_r = ((column[0] - column[-1]) / current_A for column in columns)
+    return float(value), float(np.hypot(by_q * estimate.sd_q_mobile, by_r * estimate.sd_r_o))
 
 
 def part(cell: str, every: int) -> Tables:

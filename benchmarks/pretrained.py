@@ -48,11 +48,7 @@ from benchmarks.training import Recipe, train_or_load, training_minutes
 from sb3_lac.onnx import export_onnx
 
 #: What each policy finds.
-FOUND: dict[str, tuple[str, ...]] = {
-    "BatteryVoltageJoint-v0": ("q_mobile", "r_o"),
-    "BatteryVoltageQmax-v0": ("q_mobile",),
-    "BatteryVoltageRo-v0": ("r_o",),
-}
+FOUND: dict[str, tuple[str, ...]] = {"BatteryVoltageJoint-v0": ("q_mobile", "r_o")}
 #: How far kn, tDiffusion, to and tsn of the cells are from the model's, in training and as the observation takes them to be.
 MISMATCH = 0.2
 #: Options of the task that a policy needs when it is used.

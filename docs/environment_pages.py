@@ -1,6 +1,6 @@
 """
-Write what the documentation takes from the code: the page of each environment, docs/environments/ID.md, from the docstring of
-its task or class, and in other pages the tables of environments, data sets, estimators and columns of the evaluation.
+Write what the documentation takes from the code: the page of each environment without a battery, docs/environments/ID.md, from
+the docstring of its class, and in other pages the tables of environments, data sets, estimators and columns of the evaluation.
 
 .. code-block:: bash
 
@@ -17,7 +17,6 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
@@ -46,30 +45,22 @@ IDS = [
 CONTROL_IDS = [env_id for env_id in IDS if env_id not in TASKS]
 
 
-def page_class(env_id: str) -> Callable[..., Any]:
-    """The class whose docstring is the page of an environment: its task's for a battery, and its own else."""
-    spec = gym.spec(env_id)
-    return load_env_creator(str(spec.kwargs.get("task", spec.entry_point)))
-
-
 def environment_page(env_id: str) -> str:
-    """The page of an environment, with links to the pages of the others that it names."""
-    page = inspect.getdoc(page_class(env_id)) or ""
-    picture = ""
-    if env_id in CONTROL_IDS:
-        path, end = f"../pictures/{env_id}", "The end of the same episode of the reference controller, as `render()` draws it."
-        picture = f"![{env_id} in motion]({path}.gif)\n\n*{EPISODES[env_id].caption}*\n\n"
-        picture += f"![States and costs of {env_id}]({path}.png)\n\n*{end}*\n\n"
+    """The page of an environment without a battery, with links to the pages of the others that it names."""
+    page = inspect.getdoc(load_env_creator(str(gym.spec(env_id).entry_point))) or ""
+    path, end = f"../pictures/{env_id}", "The end of the same episode of the reference controller, as `render()` draws it."
+    picture = f"![{env_id} in motion]({path}.gif)\n\n*{EPISODES[env_id].caption}*\n\n"
+    picture += f"![States and costs of {env_id}]({path}.png)\n\n*{end}*\n\n"
     return f"# {env_id}\n\n{picture}" + re.sub(rf"``((?!{env_id}\b)\w+-v\d+)``", r"[`\1`](\1.md)", page) + "\n"
 
 
 def ids() -> str:
     """All environments in one table."""
-    # spaces and episodes do not depend on the discharges; these are quickly made, and as many as a life has cycles
-    dataset = TrajectoryDataset.generate(("q_mobile", "r_o"), 20, [constant(8.0)], seed=0)
+    # spaces and episodes do not depend on the discharges; these are quickly made
+    dataset = TrajectoryDataset.generate(("q_mobile", "r_o"), 4, [constant(8.0)], seed=0)
     rows = []
     for env_id in TASKS:
-        task = page_class(env_id)(1, dataset=dataset)
+        task = load_env_creator(TASKS[env_id])(1, dataset=dataset)
         rows.append(
             {
                 "id": f"[`{env_id}`](environments/{env_id}.md)",
@@ -165,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--docs", type=Path, default=DOCS)
     docs = parser.parse_args(arguments).docs
-    pages = {docs / "environments" / f"{env_id}.md": environment_page(env_id) for env_id in IDS}
+    pages = {docs / "environments" / f"{env_id}.md": environment_page(env_id) for env_id in CONTROL_IDS}
     pages |= {docs / f"{name}.md": render(name, (docs / f"{name}.md").read_text(encoding="utf-8")) for name in PARTS}
     for page, text in pages.items():
         with replacing(page) as part:

@@ -64,7 +64,7 @@ def _without_data(env_id: str, options: dict[str, Any]) -> dict[str, Any]:
     reading_s = {**kind.options(), **options}["reading_s"]
     time_s = np.array([0.0, 1.0, 2.0, 3.0]) * np.max(reading_s)
     blank = Samples(time_s, np.full(4, NEW_CELL.VEOD), np.zeros(4))
-    return {**options, "cost": "misfit", "dataset": [blank] * kind.discharges_of_an_episode(options)}
+    return {**options, "cost": "misfit", "dataset": [blank]}
 
 
 class PolicyEstimator(OnlineEstimator):
@@ -84,8 +84,6 @@ class PolicyEstimator(OnlineEstimator):
     - A policy of a full-state environment estimates at every step, from the true state at the first sample on.
     - A policy of a voltage-only environment starts with the estimate of a new cell, and moves it every ``decision_s``. It
       takes any record that starts fully charged, simulated or recorded, or a stream (:meth:`update`).
-    - A policy of ``BatteryAging-v0`` takes such records life after life, ``cycles`` of them each, and carries its estimate
-      over from one to the next. It takes no stream.
 
     A policy states standard deviations if its observation has a fit (options ``nuisance`` and ``path``): those of the fit
     under its priors, with the distance of the estimate from it. It has settled if they are as small as least squares ask for,
@@ -127,11 +125,10 @@ class PolicyEstimator(OnlineEstimator):
         A policy of LAC that comes with the package, with the options of the task that it was trained on. What made it and what
         it is worth says :func:`~battery_env.policies.pretrained.pretrained_card`.
 
-        :param env_id: id of a voltage-only environment of single discharges
+        :param env_id: id of a voltage-only environment
         :param decision_s: time between two estimates, s
-        :param recorded: whether for recorded cells: of both parameters one that has learned along the lives of the bundled
-            cells, of one of them one that has learned on a model whose error wanders. By default one that has learned on a
-            model with wrong constants, as simulated cells have
+        :param recorded: whether for recorded cells: one that has learned along the lives of the bundled cells. By default one
+            that has learned on a model with wrong constants, as simulated cells have
         :raises ValueError: for another id, or a time out of range
         :raises ImportError: without the extra ``battery_env[onnx]``
         """
@@ -172,8 +169,8 @@ class PolicyEstimator(OnlineEstimator):
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
-        if not issubclass(self.task_class, VoltageTask) or self.task_class.discharges_of_an_episode(self.options) > 1:
-            raise ValueError(f"a policy of {self.env_id} takes no stream: it needs the full state, or a whole life")
+        if not issubclass(self.task_class, VoltageTask):
+            raise ValueError(f"a policy of {self.env_id} takes no stream: it needs the full state")
         if temperature_C is not None:
             raise ValueError("a policy takes no temperature: its model is isothermal. Leave temperature_C out.")
         if not self._samples:

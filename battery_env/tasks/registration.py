@@ -6,17 +6,14 @@ from gymnasium.envs.registration import register, registry
 
 _PACKAGE = "battery_env.tasks"
 
-#: By id, the task that the environments for one cell and for many run; its docstring is their page.
+#: By id, the task that the environments for one cell and for many run; their pages are in docs/environments.
 TASKS: dict[str, str] = {
-    "BatteryQmax-v0": f"{_PACKAGE}.full_state.pages:BatteryQmax",
-    "BatteryRo-v0": f"{_PACKAGE}.full_state.pages:BatteryRo",
-    "BatteryJoint-v0": f"{_PACKAGE}.full_state.pages:BatteryJoint",
-    "BatteryQmaxPaper-v0": f"{_PACKAGE}.full_state.pages:BatteryQmaxPaper",
-    "BatteryRoPaper-v0": f"{_PACKAGE}.full_state.pages:BatteryRoPaper",
-    "BatteryVoltageQmax-v0": f"{_PACKAGE}.voltage.pages:BatteryVoltageQmax",
-    "BatteryVoltageRo-v0": f"{_PACKAGE}.voltage.pages:BatteryVoltageRo",
-    "BatteryVoltageJoint-v0": f"{_PACKAGE}.voltage.pages:BatteryVoltageJoint",
-    "BatteryAging-v0": f"{_PACKAGE}.voltage.aging:BatteryAging",
+    "BatteryQmax-v0": f"{_PACKAGE}.full_state.task:BatteryQmax",
+    "BatteryRo-v0": f"{_PACKAGE}.full_state.task:BatteryRo",
+    "BatteryJoint-v0": f"{_PACKAGE}.full_state.task:BatteryJoint",
+    "BatteryQmaxPaper-v0": f"{_PACKAGE}.full_state.task:BatteryQmaxPaper",
+    "BatteryRoPaper-v0": f"{_PACKAGE}.full_state.task:BatteryRoPaper",
+    "BatteryVoltageJoint-v0": f"{_PACKAGE}.voltage.task:VoltageTask",
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class CalibrationTask(ABC):
     #: whether estimates are independent of each other, so that the mean of those over a record counts, and not the last one
     is_averaged: ClassVar[bool]
 
-    parameters: tuple[Literal["q_mobile", "r_o"], ...]
+    parameters: tuple[str, ...]
     cells: int
     dataset: Sequence[Record]
     observation_size: int

@@ -22,8 +22,7 @@ from battery_env.records.discharge import load_nasa_discharges
 from battery_env.records.model import RecordModel
 from battery_env.records.samples import Stream
 from battery_env.sensors import SensorErrors
-from battery_env.tasks.voltage.pages import BatteryVoltageJoint, BatteryVoltageQmax
-from battery_env.tasks.voltage.task import ESTIMATE_RANGES
+from battery_env.tasks.voltage.task import ESTIMATE_RANGES, VoltageTask
 from tests.policies import Always
 
 AGES = 5
@@ -335,7 +334,7 @@ class TestTask:
 
     def test_an_action_goes_beside_the_fit_in_its_standard_deviations(self, path):
         data = TrajectoryDataset.along(path, 4, [LOAD], seed=3)
-        task = BatteryVoltageJoint(4, dataset=data, path=path, cost="state", new_readings=(0, 0))
+        task = VoltageTask(4, dataset=data, path=path, cost="state", new_readings=(0, 0))
         task.start(np.arange(4), [np.random.default_rng(k) for k in range(4)])
         assert task.observation().shape == (4, 120)
         fitted, (low, high) = task.fitted(), np.transpose(list(ESTIMATE_RANGES.values()))
@@ -360,14 +359,14 @@ class TestTask:
     def test_it_knows_all_at_once(self, path):
         for others in ({"nuisance": 0.2}, {"mismatch": 0.2}):
             with pytest.raises(ValueError, match="path says how far constants are off"):
-                BatteryVoltageJoint(1, path=path, **others)
+                VoltageTask(1, path=path, **others)
         with pytest.raises(ValueError, match="path says how far constants are off"):
-            BatteryVoltageQmax(1, path=path)
+            VoltageTask(1, parameters=["q_mobile"], path=path)
 
     def test_irregular_readings_are_drawn(self, path):
         data = TrajectoryDataset.along(path, 4, [LOAD], seed=3)
-        steps = np.diff(BatteryVoltageJoint(1, dataset=data, path=path, reading_s=(2.0, 20.0)).readings.time_s)
+        steps = np.diff(VoltageTask(1, dataset=data, path=path, reading_s=(2.0, 20.0)).readings.time_s)
         steps = steps[steps > 0.0]
         assert steps.min() >= 1.0 and steps.max() <= 30.0 and len(np.unique(steps)) > 10
         with pytest.raises(ValueError, match=r"interval_s must be \(least, most\)"):
-            BatteryVoltageJoint(1, dataset=data, path=path, reading_s=(20.0, 2.0))
+            VoltageTask(1, dataset=data, path=path, reading_s=(20.0, 2.0))

@@ -66,7 +66,7 @@ def test_the_last_of_a_trace_is_the_estimate():
 
 
 def test_what_is_known_has_none():
-    policy = PolicyEstimator(Step(columns=slice(101, 102)), "BatteryVoltageRo-v0", **OPTIONS)
+    policy = PolicyEstimator(Step(columns=slice(101, 102)), ENV_ID, parameters=["r_o"], **OPTIONS)
     estimate = policy.estimate(whole_discharge(q_mobile=NEW_CELL.q_mobile))
     assert estimate.settled and np.isnan(estimate.sd_q_mobile)
     assert abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o < 0.02

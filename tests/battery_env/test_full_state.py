@@ -13,7 +13,7 @@ from battery_env.electrochemistry import NEW_CELL, QNB, STATE_NAMES, UNCERTAIN_C
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.tasks.data import standard_dataset
 from battery_env.tasks.full_state.layout import ERROR_SCALE, OBSERVED, SCALED
-from battery_env.tasks.full_state.pages import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
+from battery_env.tasks.full_state.task import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.trajectories import TrajectoryDataset
 
 

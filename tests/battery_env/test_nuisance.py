@@ -10,8 +10,8 @@ from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
 from battery_env.tasks.vector_env import CalibrationVectorEnv
 from battery_env.tasks.voltage.fit import Known, found_size, nuisance_step
-from battery_env.tasks.voltage.pages import BatteryVoltageJoint
 from battery_env.tasks.voltage.readings import Readings
+from battery_env.tasks.voltage.task import VoltageTask
 
 UNKNOWNS = ("q_mobile", "r_o", "offset_V", *UNCERTAIN_CONSTANTS)
 KNOWS_NOTHING = (1e6, 1e3, 1e3, *[100.0] * 4)
@@ -88,7 +88,7 @@ class TestTask:
     def test_it_is_shown_behind_the_rest_of_the_observation(self, data):
         shown = []
         for nuisance in (0.0, 0.2):
-            task = BatteryVoltageJoint(4, dataset=data, nuisance=nuisance)
+            task = VoltageTask(4, dataset=data, nuisance=nuisance)
             task.start(np.arange(4), [np.random.default_rng(k) for k in range(4)])
             task.advance(np.full((4, 2), 0.1))
             shown.append(task.observation())
@@ -96,8 +96,8 @@ class TestTask:
         np.testing.assert_array_equal(shown[0], shown[1][:, :102])
 
     def test_a_cell_is_the_same_alone_and_among_others(self, data):
-        many = CalibrationVectorEnv(BatteryVoltageJoint, 3, nuisance=0.2, dataset=data)
-        one = CalibrationVectorEnv(BatteryVoltageJoint, 1, nuisance=0.2, dataset=data)
+        many = CalibrationVectorEnv(VoltageTask, 3, nuisance=0.2, dataset=data)
+        one = CalibrationVectorEnv(VoltageTask, 1, nuisance=0.2, dataset=data)
         together, alone = many.reset(seed=3)[0], one.reset(seed=5)[0]
         for _ in range(20):  # beyond the end of an episode
             np.testing.assert_array_equal(together[2], alone[0])

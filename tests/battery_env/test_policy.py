@@ -8,8 +8,7 @@ import pytest
 from battery_env import NEW_CELL, CellParameters, PolicyEstimator, TrajectoryDataset, evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
-from battery_env.sensors import RandomSensorErrors, SensorErrors
-from battery_env.tasks.voltage.aging import simulated_lives
+from battery_env.sensors import SensorErrors
 from battery_env.tasks.voltage.task import LARGEST_STEPS
 from tests.policies import Always
 
@@ -41,36 +40,14 @@ def test_it_sees_what_the_sensors_show_and_nothing_more(data):
 
 
 def test_what_is_not_searched_for_is_known(data):
-    traces = PolicyEstimator(Always(-0.1), "BatteryVoltageRo-v0").trace(data)
+    traces = PolicyEstimator(Always(-0.1), "BatteryVoltageJoint-v0", parameters=["r_o"]).trace(data)
     for trace, q_mobile in zip(traces, data.q_mobile, strict=True):
         assert (trace.q_mobile == q_mobile).all() and trace.r_o[0] < NEW_CELL.r_o
 
 
-def test_a_life_is_followed_with_one_estimate():
-    lives = simulated_lives(2, 3, seed=0)
-    policy = Always(-0.1, 0.1)
-    estimator = PolicyEstimator(policy, "BatteryAging-v0", decision_s=300.0, cycles=3)
-    traces = estimator.trace(lives)
-    assert len(traces) == 6 and policy.seen[0].shape == (2, 104)
-    for n, (trace, discharge) in enumerate(zip(traces, lives, strict=True)):
-        readings = int(discharge.time_s[-1] // 10)
-        np.testing.assert_array_equal(trace.time_s, np.append(np.arange(300.0, 10.0 * readings, 300.0), 10.0 * readings))
-        before_C = NEW_CELL.q_mobile if n % 3 == 0 else traces[n - 1].q_mobile[-1]
-        moved_C = 0.01 * LARGEST_STEPS["q_mobile"] * np.arange(1, len(trace.time_s) + 1)
-        np.testing.assert_allclose(trace.q_mobile, np.maximum(before_C - moved_C, 3500.0))
-    # the estimate that was carried over stands beside the one of now
-    carried, now = policy.seen[0][:, -2:], policy.seen[0][:, -4:-2]
-    np.testing.assert_array_equal(carried, now)
-    scores = evaluate(estimator, lives, RandomSensorErrors((0.001, 0.030), 0.010))
-    np.testing.assert_array_equal(scores["q_mobile"], lives.q_mobile)
-    assert scores["q_mobile_final"][2] == traces[2].q_mobile[-1]
-
-
 def test_bad_arguments_are_refused(data):
     with pytest.raises(ValueError, match=r"decision_s must be a positive, finite number, got 0\.0"):
-        PolicyEstimator(Always(0.0), "BatteryVoltageRo-v0", decision_s=0.0)
-    with pytest.raises(ValueError, match="3 discharges are no whole number of lives of 20 cycles"):
-        PolicyEstimator(Always(0.0, 0.0), "BatteryAging-v0").trace(data[:3])
+        PolicyEstimator(Always(0.0), "BatteryVoltageJoint-v0", decision_s=0.0)
     with pytest.raises(ValueError, match="CartPole-v1 is no calibration environment"):
         PolicyEstimator(Always(0.0), "CartPole-v1")
 

@@ -33,6 +33,14 @@ def with_factor(model, name, factor):
     return RecordModel(cell, model.thermal, model.dt_s, model.initial)
 
 
+@pytest.mark.parametrize(("load", "unit"), [(2.0, "current"), (0.5, "current"), (7.0, "power")])
+def test_a_capacity_is_the_charge_of_a_simulated_discharge(load, unit):
+    discharge = simulate(load, 6000.0, 0.15, load_unit=unit, cut_off_V=2.8)
+    (capacity_Ah,) = RecordModel().capacity_Ah([constant(load, unit)], 2.8, 6000.0, 0.15)
+    # the end lies within the last step
+    assert 0.0 < discharge.current_A.sum() / 3600.0 - capacity_Ah < discharge.current_A[-1] / 3600.0
+
+
 @pytest.mark.parametrize("model", MODELS, ids=MODEL_IDS)
 def test_derivatives_are_those_of_the_simulated_voltage(model):
     current_A, q, r_o = CURRENT_A[:1200], 6000.0, 0.15

@@ -12,8 +12,8 @@ from battery_env.trajectories import TrajectoryDataset
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
 #: All environments, with short episodes.
-CASES = [(env_id, {"episode_steps": 4}) for env_id in TASKS if env_id != "BatteryAging-v0"]
-CASES += [("BatteryAging-v0", {"cycles": 4, "decisions_per_cycle": 2})]
+CASES = [(env_id, {"episode_steps": 4}) for env_id in TASKS]
+CASES += [("BatteryVoltageJoint-v0", {"episode_steps": 4, "parameters": ["r_o"]})]
 # whatever draws at random
 NOISY = {"initial_perturbation": 3.0, "continue_probability": 0.5, "first_sample_probability": 0.3, "resync": 3}
 
@@ -50,8 +50,8 @@ def assert_same_infos(found, expected, mask=None):
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 @pytest.mark.parametrize(("env_id", "options"), [*CASES, *((env_id, {"episode_steps": 4} | NOISY) for env_id in IDS)])
-def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, options, mode, discharges, lives):
-    batch, sync = make_pair(env_id, mode, dataset=lives if env_id == "BatteryAging-v0" else discharges, **options)
+def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, options, mode, discharges):
+    batch, sync = make_pair(env_id, mode, dataset=discharges, **options)
     assert (batch.observation_space, batch.action_space) == (sync.observation_space, sync.action_space)
     assert batch.metadata["autoreset_mode"] is mode and batch.metadata["discount"] == 0.8
     sync.action_space.seed(0)

@@ -1,7 +1,8 @@
-"""The voltage-only tasks and the aging one."""
+"""The voltage-only tasks."""
 
 import os
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -9,11 +10,9 @@ from gymnasium.utils.env_checker import check_env
 from battery_env import NEW_CELL, Discharge, RandomSensorErrors, TrajectoryDataset, load_nasa_discharges
 from battery_env.loads import RandomPiecewise
 from battery_env.tasks.env import CalibrationEnv
-from battery_env.tasks.full_state.pages import BatteryQmax
-from battery_env.tasks.voltage.aging import BatteryAging
-from battery_env.tasks.voltage.pages import BatteryVoltageJoint, BatteryVoltageQmax, BatteryVoltageRo
+from battery_env.tasks.full_state.task import BatteryQmax
 from battery_env.tasks.voltage.readings import Readings
-from battery_env.tasks.voltage.task import ESTIMATE_RANGES, LARGEST_STEPS
+from battery_env.tasks.voltage.task import ESTIMATE_RANGES, LARGEST_STEPS, VoltageTask
 
 BOTH = ("q_mobile", "r_o")
 LOW, HIGH = np.array([ESTIMATE_RANGES[name] for name in BOTH]).T
@@ -34,8 +33,8 @@ def generators(n, seed=0):
     return [np.random.default_rng(seed + k) for k in range(n)]
 
 
-def started(data, kind=BatteryVoltageJoint, cells=4, seed=0, **options):
-    task = kind(cells, dataset=data, **options)
+def started(data, cells=4, seed=0, **options):
+    task = VoltageTask(cells, dataset=data, **options)
     task.start(np.arange(cells), generators(cells, seed))
     return task
 
@@ -51,9 +50,9 @@ class TestTask:
             np.testing.assert_array_equal(report[name], report[f"{name}_hat"])
         np.testing.assert_allclose(report["voltage"], report["voltage_hat"], atol=1e-3)
 
-    @pytest.mark.parametrize("kind", [BatteryVoltageQmax, BatteryVoltageRo, BatteryVoltageJoint])
-    def test_actions_move_the_estimate_within_its_range(self, data, kind):
-        task, parameters = started(data, kind, start="true"), kind.parameters
+    @pytest.mark.parametrize("parameters", [("q_mobile",), ("r_o",), BOTH])
+    def test_actions_move_the_estimate_within_its_range(self, data, parameters):
+        task = started(data, parameters=parameters, start="true")
         before = task.estimate.copy()
         task.advance(np.full((4, len(parameters)), -0.5))
         for column, name in enumerate(BOTH):
@@ -123,13 +122,13 @@ class TestTask:
     def test_training_sees_what_evaluation_shows(self, data, fault):
         """An episode looks like a record to which the same errors were applied."""
         sensors = {**EXACT, **fault}
-        task = BatteryVoltageJoint(1, dataset=data, start="true", **sensors)
+        task = VoltageTask(1, dataset=data, start="true", **sensors)
         task.start(np.zeros(1, dtype=int), generators(1, seed=7), {"discharge": 3, "reading": 150})
         (generator,) = generators(1, seed=7)
         generator.integers(0, 30, size=8)  # how many readings arrive
         shown = RandomSensorErrors(**sensors).draw(generator).apply(data[3], generator)
-        evaluated = BatteryVoltageJoint.follow([shown], 1500.0, start="true", **sensors)
-        exact = BatteryVoltageJoint.follow([data[3]], 1500.0, start="true", **sensors)
+        evaluated = VoltageTask.follow([shown], 1500.0, start="true", **sensors)
+        exact = VoltageTask.follow([data[3]], 1500.0, start="true", **sensors)
         np.testing.assert_allclose(task.observation(), evaluated.observation(), atol=0.05)
         assert np.abs(exact.observation() - evaluated.observation()).max() > 0.2
 
@@ -141,9 +140,9 @@ class TestTask:
             np.testing.assert_allclose(task.advance(action), plain.advance(action) + 2.0 * change)
             np.testing.assert_array_equal(task.observation()[:, -2:], action.astype(np.float32))
 
-    @pytest.mark.parametrize("kind", [BatteryVoltageQmax, BatteryVoltageRo, BatteryVoltageJoint])
-    def test_the_error_of_the_state_is_that_of_the_parameters(self, data, kind):
-        task, by_misfit = (started(data, kind, cost=cost) for cost in ("state", "misfit"))
+    @pytest.mark.parametrize("parameters", [("q_mobile",), ("r_o",), BOTH])
+    def test_the_error_of_the_state_is_that_of_the_parameters(self, data, parameters):
+        task, by_misfit = (started(data, parameters=parameters, cost=cost) for cost in ("state", "misfit"))
         np.testing.assert_array_equal(task.observation(), by_misfit.observation())
         for _ in range(8):
             action = np.random.default_rng(0).uniform(-1.0, 1.0, (4, len(task.parameters)))
@@ -158,9 +157,9 @@ class TestTask:
     def test_a_recording_does_not_know_its_state(self, data):
         recorded = [discharge.loaded_part(3.0) for discharge in load_nasa_discharges("B0005")[:2]]
         with pytest.raises(ValueError, match="and 2 of 10 discharges are not simulated: take cost='misfit'"):
-            BatteryVoltageJoint(1, dataset=[*data, *recorded], cost="state")
+            VoltageTask(1, dataset=[*data, *recorded], cost="state")
         # a policy that was trained with it can be asked about one
-        task = BatteryVoltageJoint.follow(recorded, 30, cost="state")
+        task = VoltageTask.follow(recorded, 30, cost="state")
         assert np.isfinite(task.advance(np.zeros((2, 2)))).all()
 
     @pytest.mark.parametrize(
@@ -178,27 +177,28 @@ class TestTask:
             ({"nuisance": -0.1}, "nuisance must be finite and at least 0, got -0.1"),
             ({"cell": {"kn": 1.0}}, "cell must be CellParameters or None"),
             ({"load": "constant"}, "dataset stands in place of load"),
+            ({"parameters": ["kn"]}, "parameters must be one or both of"),
             ({"cost": "label"}, "cost must be one of .*, got 'label'"),
         ],
     )
     def test_bad_options_are_refused(self, data, options, message):
         with pytest.raises((TypeError, ValueError), match=message):
-            BatteryVoltageJoint(1, dataset=data, **options)
+            VoltageTask(1, dataset=data, **options)
 
     def test_discharges_without_their_start_are_refused(self, data):
         with pytest.raises(ValueError, match="dataset leaves out the start of discharges"):
-            BatteryVoltageJoint(1, dataset=data.trimmed(0.05, 0.95))
+            VoltageTask(1, dataset=data.trimmed(0.05, 0.95))
 
 
-@pytest.mark.parametrize(("kind", "actions"), [(BatteryVoltageJoint, 2), (BatteryVoltageQmax, 1), (BatteryVoltageRo, 1)])
+@pytest.mark.parametrize("parameters", [BOTH, ("q_mobile",), ("r_o",)])
 class TestEnvironments:
-    def test_gymnasium_checks_pass(self, kind, actions, data):
-        env = CalibrationEnv(kind, dataset=data)
-        assert env.action_space.shape == (actions,)
+    def test_gymnasium_checks_pass(self, parameters, data):
+        env = gym.make("BatteryVoltageJoint-v0", parameters=parameters, dataset=data).unwrapped
+        assert env.action_space.shape == (len(parameters),) and env.task.parameters == parameters
         check_env(env, skip_render_check=True)
 
-    def test_reset_options(self, kind, actions, data):
-        env = CalibrationEnv(kind, dataset=data)
+    def test_reset_options(self, parameters, data):
+        env = CalibrationEnv(VoltageTask, parameters=parameters, dataset=data)
         name = env.task.parameters[0]
         value = {"q_mobile": 5000.0, "r_o": 0.2}[name]
         _, info = env.reset(seed=0, options={"discharge": 3, "reading": 40, f"{name}_hat": value})
@@ -237,86 +237,29 @@ class TestOwnCell:
     def test_with_them_the_truth_explains_a_recording_and_with_others_it_does_not(self, own):
         as_recorded = [Discharge(trajectory.time_s, trajectory.voltage_V, trajectory.current_A) for trajectory in own]
         for cell, explained in ((self.CELL, True), (None, False)):
-            task = BatteryVoltageJoint(1, dataset=as_recorded, cell=cell, **EXACT)
+            task = VoltageTask(1, dataset=as_recorded, cell=cell, **EXACT)
             for discharge, trajectory in enumerate(own):
                 true = {"q_mobile_hat": trajectory.q_mobile, "r_o_hat": trajectory.r_o}
                 task.start(np.array([0]), generators(1), {"discharge": discharge, "reading": 20, **true})
                 cost = task.advance(np.zeros((1, 2)))[0]
                 assert (cost < 0.2) == explained  # asinh of 0.4 mV over 2 mV
 
-    @pytest.mark.parametrize(
-        ("kind", "changed"),
-        [(BatteryVoltageJoint, {"q_mobile": 20_000.0}), (BatteryVoltageJoint, {"r_o": 0.01}), (BatteryAging, {"r_o": 0.01})],
-    )
-    def test_cells_that_no_estimate_reaches_are_refused(self, kind, changed):
+    @pytest.mark.parametrize("changed", [{"q_mobile": 20_000.0}, {"r_o": 0.01}])
+    def test_cells_that_no_estimate_reaches_are_refused(self, changed):
         (name,) = changed
         with pytest.raises(ValueError, match=f"{name} of cell must lie within .*, where the task looks for it, got"):
-            kind(1, cell=self.CELL.replace(**changed))
+            VoltageTask(1, cell=self.CELL.replace(**changed))
 
     def test_a_saved_data_set_is_named_by_its_file_and_read_anew_when_it_has_changed(self, own, data, tmp_path):
         file = tmp_path / "own.npz"
         own.save(file)
-        task = BatteryVoltageJoint(2, dataset=str(file))
-        assert task.readings.cell == self.CELL and task.dataset is BatteryVoltageJoint(1, dataset=file).dataset
+        task = VoltageTask(2, dataset=str(file))
+        assert task.readings.cell == self.CELL and task.dataset is VoltageTask(1, dataset=file).dataset
         np.testing.assert_array_equal(task.dataset.q_mobile, own.q_mobile)
         file.unlink()
         data.save(file)
         os.utime(file, ns=(0, 0))
-        assert BatteryVoltageJoint(2, dataset=str(file)).readings.cell == NEW_CELL
+        assert VoltageTask(2, dataset=str(file)).readings.cell == NEW_CELL
         np.testing.assert_array_equal(BatteryQmax(1, dataset=file).dataset.q_mobile, data.q_mobile)
         with pytest.raises(FileNotFoundError, match=r"none\.npz"):
-            BatteryVoltageJoint(1, dataset=tmp_path / "none.npz")
-
-
-class TestAging:
-    @pytest.fixture
-    def task(self, lives):
-        task = BatteryAging(2, dataset=lives, cycles=4, decisions_per_cycle=3)
-        task.start(np.arange(2), generators(2))
-        return task
-
-    def test_cells_wear(self, lives):
-        q_mobile, r_o = lives.q_mobile.reshape(3, 4), lives.r_o.reshape(3, 4)
-        assert (np.diff(q_mobile, axis=1) < 0.0).all() and (np.diff(r_o, axis=1) > 0.0).all()
-        assert ((q_mobile[:, 0] >= 6800.0) & (q_mobile[:, 0] <= 7600.0)).all()
-        for lost in (1.0 - q_mobile[:, -1] / q_mobile[:, 0], 0.5 * (r_o[:, -1] / r_o[:, 0] - 1.0)):
-            assert ((lost >= 0.1) & (lost <= 0.5)).all()
-
-    def test_a_life_goes_through_its_cycles_with_one_estimate(self, task):
-        life = task.discharge.copy() // 4
-        np.testing.assert_array_equal(task.observation()[:, -2:], task.observation()[:, -4:-2])
-        estimates = []
-        for step in range(12):
-            assert not task.truncated().any()
-            np.testing.assert_array_equal(task.discharge, 4 * life + step // 3)
-            task.advance(np.full((2, 2), -0.1))
-            estimates.append(task.estimate.copy())
-            carried = estimates[step - (step + 1) % 3] if step >= 2 else np.tile([NEW_CELL.q_mobile, NEW_CELL.r_o], (2, 1))
-            if step < 11:
-                scaled = 2.0 * (carried - LOW) / (HIGH - LOW) - 1.0
-                np.testing.assert_allclose(task.observation()[:, -2:], scaled, atol=1e-6)
-        assert task.truncated().all()
-
-    def test_environment(self, lives):
-        env = CalibrationEnv(BatteryAging, dataset=lives, cycles=4, decisions_per_cycle=2)
-        check_env(env, skip_render_check=True)
-        with pytest.raises(ValueError, match="first of a life of 4 cycles, got 3"):
-            env.reset(options={"discharge": 3})
-        with pytest.raises(ValueError, match="12 discharges are no whole number of lives of 5 cycles"):
-            CalibrationEnv(BatteryAging, dataset=lives, cycles=5)
-        with pytest.raises(TypeError, match="episode_steps"):
-            CalibrationEnv(BatteryAging, dataset=lives, episode_steps=3)
-        with pytest.raises(TypeError, match=r"decisions_per_cycle must be a whole number, got 2\.0"):
-            CalibrationEnv(BatteryAging, dataset=lives, cycles=4, decisions_per_cycle=2.0)
-
-    def test_where_no_reading_has_to_arrive_a_cycle_starts_with_some_all_the_same(self, lives):
-        task = BatteryAging(50, dataset=lives, cycles=4, decisions_per_cycle=1, new_readings=(0, 1))
-        task.start(np.arange(50), [np.random.default_rng(n) for n in range(50)])
-        for _ in range(3):
-            cost = task.advance(np.zeros((50, 2)))
-            assert np.isfinite(task.observation()).all() and (cost > 0.0).all() and (task.count >= 3).all()
-
-    @pytest.mark.parametrize(("kind", "data"), [(BatteryVoltageJoint, False), (BatteryVoltageQmax, True)])
-    def test_a_life_needs_its_discharges_and_both_parameters(self, lives, kind, data):
-        with pytest.raises(ValueError, match=r"cycles = 4 needs a dataset .* both parameters"):
-            kind(1, 4, dataset=lives if data else None)
+            VoltageTask(1, dataset=tmp_path / "none.npz")

@@ -245,17 +245,17 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint_and_says_so(tmp_path, mo
 
 
 VOLTAGE_CONFIG = """
-BatteryVoltageRo-v0: {policy: MlpPolicy, n_timesteps: 96, n_envs: 16, learning_starts: 32, batch_size: 16, buffer_size: 200}
+BatteryVoltageJoint-v0: {policy: MlpPolicy, n_timesteps: 96, n_envs: 16, learning_starts: 32, batch_size: 16, buffer_size: 200}
 """
 
 
 def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_path, capsys):
     for algo in ("lac", "sac"):
         (tmp_path / "zoo_configs" / f"{algo}.yml").write_text(VOLTAGE_CONFIG)
-    chosen = ["--envs", "BatteryVoltageRo-v0", "--algos", "lac", "sac", "--evaluations", "1", "--jobs", "1", "--out", "out"]
+    chosen = ["--envs", "BatteryVoltageJoint-v0", "--algos", "lac", "sac", "--evaluations", "1", "--jobs", "1", "--out", "out"]
     compare.main(chosen)
     out = tmp_path / "out"
-    table = pd.read_csv(out / "BatteryVoltageRo-v0.csv")
+    table = pd.read_csv(out / "BatteryVoltageJoint-v0.csv")
     calibrators = ["LAC", "SAC", "least squares", "Kalman filter"]
     assert table["sensor"].tolist() == [sensor for sensor in contests.SENSORS for _ in calibrators]
     assert table["calibrator"].tolist() == 2 * calibrators
@@ -264,13 +264,13 @@ def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_pa
     least_squares = table[table["calibrator"] == "least squares"].set_index("sensor")["r_o_second_half_percent"]
     assert (least_squares < table.loc[table["calibrator"] == "LAC", "r_o_second_half_percent"].min()).all()
     assert least_squares.iloc[1] > least_squares.iloc[0]
-    assert re.search(r"\| BatteryVoltageRo-v0 +\| 5 mV noise +\| LAC ", capsys.readouterr().out)
+    assert re.search(r"\| BatteryVoltageJoint-v0 +\| 5 mV noise +\| LAC ", capsys.readouterr().out)
     published = ROOT / "docs" / "results" / "voltage" / "BatteryVoltageJoint-v0_scores.csv"
-    assert list(pd.read_csv(out / "BatteryVoltageRo-v0_scores.csv")) == list(pd.read_csv(published, nrows=1))
-    assert len(pd.read_csv(out / "BatteryVoltageRo-v0_learning.csv")) == 2
-    assert json.loads((out / "BatteryVoltageRo-v0.json").read_text())["configuration"]["recipes"]
-    for figure in ("", "_learning"):
-        assert (out / f"BatteryVoltageRo-v0{figure}.png").stat().st_size > 0
+    assert list(pd.read_csv(out / "BatteryVoltageJoint-v0_scores.csv")) == list(pd.read_csv(published, nrows=1))
+    assert len(pd.read_csv(out / "BatteryVoltageJoint-v0_r_o_learning.csv")) == 2
+    assert json.loads((out / "BatteryVoltageJoint-v0.json").read_text())["configuration"]["recipes"]
+    for figure in ("", "_r_o_learning"):
+        assert (out / f"BatteryVoltageJoint-v0{figure}.png").stat().st_size > 0
     times = {path: path.stat().st_mtime_ns for path in [*out.rglob("model.zip"), *out.rglob("parts/*")]}
     assert len(times) == 4
     compare.main(chosen)

@@ -30,20 +30,20 @@ def train_briefly(monkeypatch):
 
 
 def test_it_writes_policies_with_their_cards_and_those_for_recorded_cells_beside_them(train_briefly, tmp_path, capsys):
-    arguments = ["--envs", "BatteryVoltageRo-v0", "--updates", "100", "--discharges", "2", "--out", str(tmp_path)]
+    arguments = ["--envs", "BatteryVoltageJoint-v0", "--updates", "100", "--discharges", "2", "--out", str(tmp_path)]
     pretrained.main(arguments)
-    policy, options = policy_of_file(tmp_path / "BatteryVoltageRo-v0.onnx")
-    assert policy.env_id == "BatteryVoltageRo-v0" and options == pretrained.OPTIONS
-    before = (tmp_path / "BatteryVoltageRo-v0.json").read_bytes()
+    policy, options = policy_of_file(tmp_path / "BatteryVoltageJoint-v0.onnx")
+    assert policy.env_id == "BatteryVoltageJoint-v0" and options == pretrained.OPTIONS
+    before = (tmp_path / "BatteryVoltageJoint-v0.json").read_bytes()
     card = json.loads(before)
     assert card["recipe"]["hyperparameters"]["env_kwargs"] == pretrained.TRAINED_WITH and card["recipe"]["seed"] == 0
-    assert len(card["scores"]) == 2 * 2 and {row["parameter"] for row in card["scores"]} == {"r_o"}
+    assert len(card["scores"]) == 2 * 2 * 2 and {row["parameter"] for row in card["scores"]} == {"q_mobile", "r_o"}
     assert len(pd.read_csv(tmp_path / "pretrained.csv")) == 2 * 2 * 2
-    assert "| BatteryVoltageRo-v0 |" in capsys.readouterr().out
+    assert "| BatteryVoltageJoint-v0 |" in capsys.readouterr().out
     # these learn on a model that wanders
     pretrained.main(["--recorded", *arguments])
-    card = json.loads((tmp_path / "BatteryVoltageRo-v0_recorded.json").read_text())
+    card = json.loads((tmp_path / "BatteryVoltageJoint-v0_recorded.json").read_text())
     assert card["recipe"]["hyperparameters"]["env_kwargs"] == pretrained.TRAINED_WITH | pretrained.RECORDED
     assert card["training_data"].endswith("noise of 2 mV per root of a second on Vo, Vsn and Vsp")
-    assert policy_of_file(tmp_path / "BatteryVoltageRo-v0_recorded.onnx")[1] == pretrained.OPTIONS
-    assert (tmp_path / "BatteryVoltageRo-v0.json").read_bytes() == before and b"Vo, Vsn" not in before
+    assert policy_of_file(tmp_path / "BatteryVoltageJoint-v0_recorded.onnx")[1] == pretrained.OPTIONS
+    assert (tmp_path / "BatteryVoltageJoint-v0.json").read_bytes() == before and b"Vo, Vsn" not in before

@@ -24,6 +24,7 @@ from battery_env.tasks.full_state.layout import (
     CELL_WITH_CONSTANTS,
     ERROR_SCALE,
     JUDGED_BY,
+    LITERAL,
     OBSERVED,
     OBSERVED_SIZE,
     SCALED,
@@ -57,7 +58,7 @@ class FullStateTask(CalibrationTask):
     other one is known, or both are to be found. The agent picks them for the model, which then takes one step from its own
     state x̂_t under the load. The cost is how far a voltage of its state, or all of it, is from the measured x_{t+1}. The
     registered tasks differ in attributes of their classes. The page of
-    :class:`~battery_env.tasks.full_state.pages.BatteryQmax` describes the options.
+    The page of ``BatteryQmax-v0`` describes the options.
 
     The cell is simulated beside the model, from the parameters and loads of the data set. The model is extended where a wrong
     parameter leaves its domain (:func:`battery_env.electrochemistry.step_into`, ``extended``).
@@ -291,3 +292,35 @@ class FullStateTask(CalibrationTask):
         voltage_hat = np.empty(self.cells)
         voltage_batch(self.now["model_state"], self.now["q_mobile_hat"], True, self.dataset.cell.packed, voltage_hat)
         return {name: voltage_hat if name == "voltage_hat" else self.now[name].copy() for name in self.REPORTED}
+
+
+class BatteryQmax(FullStateTask):
+    """Find ``q_mobile``: ``BatteryQmax-v0``."""
+
+    parameters = ("q_mobile",)
+
+
+class BatteryRo(FullStateTask):
+    """Find ``r_o``: ``BatteryRo-v0``."""
+
+    parameters = ("r_o",)
+
+
+class BatteryJoint(FullStateTask):
+    """Find both: ``BatteryJoint-v0``."""
+
+    parameters = ("q_mobile", "r_o")
+
+
+class BatteryQmaxPaper(BatteryQmax):
+    """Find ``q_mobile`` in the paper's literal form: ``BatteryQmaxPaper-v0``."""
+
+    formulation = LITERAL
+    episode_steps = 16
+
+
+class BatteryRoPaper(BatteryRo):
+    """Find ``r_o`` in the paper's literal form: ``BatteryRoPaper-v0``."""
+
+    formulation = LITERAL
+    episode_steps = 16

@@ -15,7 +15,7 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import CellParameters, check_cell
 from battery_env.electrochemistry.aging_path import AgingPath
-from battery_env.parameters import PARAMETER_NAMES, columns_of
+from battery_env.parameters import PARAMETER_NAMES, check_parameters, columns_of
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
@@ -73,15 +73,14 @@ class VoltageTask(CalibrationTask):
     the offset that the sensor may have. It knows no true parameter, so that a task can be made of recorded discharges too.
     Of simulated ones the cost may be the error of the model's hidden state instead, as in the paper.
 
-    One parameter may be known instead: the true one of a simulated discharge, and the new cell's of a recorded one. What
-    differs between the registered tasks is data of their classes; their options are described on the page of
-    :class:`~battery_env.tasks.voltage.pages.BatteryVoltageJoint`.
+    One parameter may be known instead: the true one of a simulated discharge, and the new cell's of a recorded one. What each
+    option means says the page of ``BatteryVoltageJoint-v0``.
 
     :ivar readings: what is read of the discharges
     :ivar sensors: what they are read with
     :ivar path: along which the fit in the observation looks for the cell, if along one
     :param cells: size of the batch
-    :param cycles: discharges of an episode: those of one life in the data set, through which the estimate is carried
+    :param parameters: which to search for
     :raises ValueError: for values out of range
     """
 
@@ -90,8 +89,8 @@ class VoltageTask(CalibrationTask):
     def __init__(
         self,
         cells: int,
-        cycles: int = 1,
         *,
+        parameters: Sequence[str] = PARAMETER_NAMES,
         episode_steps: int = 8,
         reading_s: float | tuple[float, float] = 10.0,
         new_readings: tuple[int, int] = (0, 29),
@@ -109,7 +108,8 @@ class VoltageTask(CalibrationTask):
         dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **sensors: Any,
     ) -> None:
-        check_counts(episode_steps=episode_steps, cycles=cycles)
+        self.parameters = check_parameters(parameters)
+        check_counts(episode_steps=episode_steps)
         check_not_negative(consistency=consistency, process_noise_V=process_noise_V, nuisance=nuisance)
         if not 0 <= new_readings[0] <= new_readings[1]:
             raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
@@ -125,16 +125,8 @@ class VoltageTask(CalibrationTask):
                     "take a task that looks for both"
                 )
         chosen = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
-        if cycles > 1 and (dataset is None or len(self.parameters) < len(PARAMETER_NAMES)):
-            raise ValueError(
-                f"cycles = {cycles} needs a dataset with the discharges of whole lives, life after life, and a task that "
-                "looks for both parameters, as both age"
-            )
         self._open(dataset, reading_s, cell, path, chosen)
-        if len(self.readings) % cycles:
-            raise ValueError(f"{len(self.readings)} discharges are no whole number of lives of {cycles} cycles")
-        self.cells, self.cycles, self.new_readings = cells, cycles, new_readings
-        self.episode_steps, self._steps_of_a_discharge = cycles * episode_steps, episode_steps
+        self.cells, self.new_readings, self.episode_steps = cells, new_readings, episode_steps
         self.sensors = replace(SENSORS, **sensors)
         self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
         self.decision_s = self.readings.interval_s * (sum(new_readings) / 2.0)
@@ -146,8 +138,7 @@ class VoltageTask(CalibrationTask):
                 f"cost='state' is the error of a state that only a simulation knows, and {is_unknown.sum()} of "
                 f"{len(is_unknown)} discharges are not simulated: take cost='misfit' for recorded ones"
             )
-        shown_numbers = 1 + (consistency > 0.0) + (cycles > 1)
-        self.observation_size = 6 * STRETCHES + 4 + len(self.parameters) * shown_numbers
+        self.observation_size = 6 * STRETCHES + 4 + len(self.parameters) * (1 + (consistency > 0.0))
         self.path, self._fit = path, None
         if nuisance > 0.0 or path is not None:
             prior = (
@@ -157,7 +148,6 @@ class VoltageTask(CalibrationTask):
             )
             self._fit = NuisanceFit(cells, self.readings.model, self.readings.cell, self.parameters, prior)
             self.observation_size += self._fit.observation_size
-        self._every_s = 0.0  # time between two decisions on a whole record; 0: the readings of an episode are drawn
         self._allocate()
 
     def _open(
@@ -208,11 +198,8 @@ class VoltageTask(CalibrationTask):
         self.count: IntArray = np.ones(cells, dtype=np.int64)
         self._arrivals: IntArray = np.zeros((cells, self.episode_steps), dtype=np.int64)
         self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
-        self._last_step: IntArray = np.zeros(cells, dtype=np.int64)  # of the discharge
+        self._last_step: IntArray = np.zeros(cells, dtype=np.int64)
         self._estimate = np.tile(self._new, (cells, 1))
-        self._carried = self._estimate.copy()  # into the discharge
-        # of the cycles to come, which are measured when the agent gets there; none on whole records, where nothing is drawn
-        self._later: list[np.random.Generator | None] = [None] * cells
         self._action = np.zeros((cells, len(self.parameters)))
         self._shown = np.zeros((SHOWN, cells, longest))
         # of the residual, V, of dV/dq_mobile, V/C, and of the ohmic drop per ohm, A
@@ -254,20 +241,15 @@ class VoltageTask(CalibrationTask):
             )
         if discharge is not None and not 0 <= discharge < len(self.readings):
             raise ValueError(f"options['discharge'] must lie within 0 .. {len(self.readings) - 1}, got {discharge!r}")
-        if discharge is not None and discharge % self.cycles:
-            raise ValueError(f"options['discharge'] must be the first of a life of {self.cycles} cycles, got {discharge}")
         for name in first:
             low, high = ESTIMATE_RANGES[name]
             if not low <= first[name] <= high:
                 raise ValueError(f"options['{name}_hat'] must lie within {low:g} .. {high:g}, got {first[name]!r}")
         fewest, most = self.new_readings
         for row, generator in zip(rows, generators, strict=True):
-            if self.cycles > 1:  # the generator of the cell is not to be drawn from later
-                self._later[row] = np.random.default_rng(generator.integers(2**63))
-            lives = len(self.readings) // self.cycles
-            n = self.cycles * int(generator.integers(lives)) if discharge is None else int(discharge)
+            n = int(generator.integers(len(self.readings))) if discharge is None else int(discharge)
             length = int(self.readings.count[n])
-            count = self._first_count(n, generator) if reading is None else int(reading)
+            count = int(generator.integers(_FEWEST_READINGS, length, endpoint=True) if reading is None else reading)
             if not 1 <= count <= length:
                 raise ValueError(f"options['reading'] must lie within 1 .. {length} for discharge {n}, got {count}")
             self._arrivals[row] = generator.integers(fewest, most + 1, size=self.episode_steps)
@@ -280,19 +262,11 @@ class VoltageTask(CalibrationTask):
         self._action[rows] = 0.0
         self._explain(rows)
 
-    def _first_count(self, discharge: int, generator: np.random.Generator | None) -> int:
-        """How many readings there are at first: any number, or in a life and on a whole record those of one decision."""
-        if generator is None:
-            return int(self._due(discharge)[0])
-        length = int(self.readings.count[discharge])
-        fewest, most = (_FEWEST_READINGS, length) if self.cycles == 1 else self.new_readings
-        return min(max(int(generator.integers(fewest, most, endpoint=True)), _FEWEST_READINGS), length)
-
-    def _due(self, discharge: int) -> IntArray:
+    def _due(self, discharge: int, every_s: float) -> IntArray:
         """How many readings each decision on a whole record knows: two at least."""
         time_s = self.readings.time_s[self.readings.part(discharge)]
-        first, last = (max(int(np.ceil(at_s / self._every_s - 1e-9)), 1) for at_s in time_s[[1, -1]])
-        due_s = self._every_s * np.arange(first, last + 1) * (1.0 + 1e-9)
+        first, last = (max(int(np.ceil(at_s / every_s - 1e-9)), 1) for at_s in time_s[[1, -1]])
+        due_s = every_s * np.arange(first, last + 1) * (1.0 + 1e-9)
         return np.asarray(np.searchsorted(time_s, due_s, side="right"), dtype=np.int64)
 
     @classmethod
@@ -303,21 +277,15 @@ class VoltageTask(CalibrationTask):
 
         :param records: discharges from full charge, simulated or recorded
         """
-        discharges = cls.discharges_of_an_episode(options)
-        task = cls(len(records) // discharges, **{"start": "new_cell", **options, "dataset": records, "cost": "misfit"})
-        task._every_s = decision_s
-        decisions = np.array([len(task._due(n)) for n in range(task.cells * discharges)]).reshape(task.cells, discharges)
-        task._arrivals = np.zeros((task.cells, int(decisions.sum(axis=1).max())), dtype=np.int64)
-        for row in range(task.cells):
-            n = row * discharges
-            task._place(row, n, task._first_count(n, None), task._first_estimate(n, None))
+        task = cls(len(records), **{"start": "new_cell", **options, "dataset": records, "cost": "misfit"})
+        due = [task._due(n, decision_s) for n in range(task.cells)]
+        task._arrivals = np.zeros((task.cells, max(map(len, due))), dtype=np.int64)
+        for n, known in enumerate(due):
+            task._place(n, n, int(known[0]), task._first_estimate(n, None))
+            task._arrivals[n, : len(known) - 1] = np.diff(known)
+            task._last_step[n] = len(known)
         task._explain()
         return task
-
-    @classmethod
-    def discharges_of_an_episode(cls, options: Mapping[str, Any]) -> int:
-        """How many discharges an episode goes through."""
-        return int(options.get("cycles", cls.options().get("cycles", 1)))
 
     def seen(self) -> tuple[IntArray, FloatArray, IntArray]:
         """Which readings the next decision knows."""
@@ -344,15 +312,10 @@ class VoltageTask(CalibrationTask):
         length = self.readings.count[discharge]
         self.discharge[row], self.count[row] = discharge, count
         self._shown[:, row, :length] = self.readings.shown(discharge)
-        self._estimate[row] = self._carried[row] = estimate
+        self._estimate[row] = estimate
         if self._fit is not None:
             self._fit.start(row)
-        decisions, step = self._steps_of_a_discharge, self._step_of_episode[row]
-        if self._every_s:
-            due = self._due(discharge)
-            decisions = len(due)
-            self._arrivals[row, step : step + decisions - 1] = np.diff(due)
-        self._last_step[row] = step + decisions
+        self._last_step[row] = self.episode_steps
 
     def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
         estimate = self._known[discharge].copy()
@@ -424,7 +387,6 @@ class VoltageTask(CalibrationTask):
             self._scaled(self._estimate),
             *([self._action] if self.consistency > 0.0 else []),
             *([] if self._fit is None else self._fit.parts(self._step, self._high - self._low)),
-            *([self._scaled(self._carried)] if self.cycles > 1 else []),
         ]
 
     def _scaled(self, estimate: FloatArray) -> FloatArray:
@@ -451,17 +413,11 @@ class VoltageTask(CalibrationTask):
         return np.asarray(np.linalg.norm(self._estimate / self._known[self.discharge] - 1.0, axis=1))
 
     def _arrive(self) -> None:
-        """New readings, or after the last decision of a cycle those of the next one."""
+        """New readings."""
         step = np.minimum(self._step_of_episode, self._arrivals.shape[1] - 1)
         arrived = self._arrivals[np.arange(self.cells), step]
         self.count = np.minimum(self.count + arrived, self.readings.count[self.discharge])
         self._step_of_episode += 1
-        goes_on = (self._step_of_episode >= self._last_step) & (self.discharge % self.cycles < self.cycles - 1)
-        for row in np.flatnonzero(goes_on).tolist():
-            discharge, generator = int(self.discharge[row]) + 1, self._later[row]
-            self._place(row, discharge, self._first_count(discharge, generator), self._estimate[row])
-            if generator is not None:
-                self._measure(row, discharge, generator)
 
     def truncated(self) -> NDArray[np.bool_]:
         """Whose episode is over. An episode goes on after the last reading: the estimate may still be moved."""

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from battery_env import GreedyOneStep, TrajectoryDataset
+from battery_env import TrajectoryDataset
 from battery_env.electrochemistry import QNS, VO, simulate, step
 from battery_env.loads import RandomPiecewise
+from benchmarks.greedy import GreedyOneStep
 
 
 @pytest.fixture(scope="module")
