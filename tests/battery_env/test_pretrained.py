@@ -187,5 +187,5 @@ class TestDamage:
 
 def test_an_observation_of_another_shape_is_refused():
     policy, _ = pretrained_policy("BatteryVoltageJoint-v0")
-    with pytest.raises(ValueError, match=r"observation must have shape \(n, 114\), got \(2, 3\)"):
+    with pytest.raises(ValueError, match=r"observation must have shape \(n, 112\), got \(2, 3\)"):
         policy.predict(np.zeros((2, 3)))
