@@ -1,26 +1,27 @@
-"""Files of what an estimator knows in the middle of a discharge, so that a program can stop and go on: npz without pickle."""
+"""Files of what an estimator knows in the middle of a discharge, so that a program can stop and go on: no pickle."""
 
 from __future__ import annotations
 
 import json
 import os
-import warnings
-from collections.abc import Mapping
 from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.files import DamagedError, npz_path, read_npz, replacing, set_aside
+from battery_env.files import replacing
 
 FORMAT_VERSION = 9
-_KIND = "state of an estimator"
+# A file is a line of JSON that begins like this, arrays as numpy writes them, and the SHA-256 of both.
+_BEGINNING = '{"kind": "state of an estimator"'
+_DIGEST_SIZE = sha256().digest_size
 
 
 class Saved:
-    """What can be written to a file in the middle of a discharge: an estimator, or many of them side by side."""
+    """What can be written to a file in the middle of a discharge."""
 
     def _made_with(self) -> dict[str, Any]:
         """What it was made with, as JSON may hold it."""
@@ -31,28 +32,27 @@ class Saved:
         raise NotImplementedError(f"{type(self).__name__} cannot be saved")
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Take :meth:`_arrays` for its own."""
-        for own, saved in [(own, arrays[name]) for name, own in self._arrays().items()]:
-            own[...] = saved
+        """Take :meth:`_arrays` of another one for its own."""
+        for name, own in self._arrays().items():
+            own[...] = arrays[name]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
         Write what is known of the discharge to a file, from which another estimator with the same arguments goes on.
 
-        :param path: where to; ``.npz`` is added if it is missing. An older state there is replaced, any other file is not
+        :param path: where to. An older state there is replaced, any other file is not
         :raises FileExistsError: if there is another file
         """
-        target, settings, arrays = npz_path(path), self._made_with(), self._arrays()
+        target, arrays = Path(path), BytesIO()
         if target.exists():
-            try:
-                read_npz(target, _KIND)
-            except DamagedError as error:
-                warnings.warn(f"{error}. It is kept as {set_aside(target).name}, and a new one takes its place.", stacklevel=2)
-            except ValueError as error:
-                raise FileExistsError(f"{target} exists, and is no state of an estimator: choose another name") from error
-        told = {"kind": _KIND, "format": FORMAT_VERSION, "settings": settings, "sha256": _digest(arrays, settings)}
+            with target.open("rb") as stream:
+                if stream.read(len(_BEGINNING)) != _BEGINNING.encode():
+                    raise FileExistsError(f"{target} exists, and is no state of an estimator: choose another name")
+        np.savez(arrays, allow_pickle=False, **self._arrays())
+        described = f'{_BEGINNING}, "format": {FORMAT_VERSION}, "settings": {json.dumps(self._made_with())}}}\n'
+        content = described.encode() + arrays.getvalue()
         with replacing(target) as part:
-            np.savez(part, metadata=np.array(json.dumps(told)), **arrays)  # type: ignore[arg-type]  # none: allow_pickle
+            part.write_bytes(content + sha256(content).digest())
         return target
 
     def load(self, path: str | os.PathLike[str]) -> None:
@@ -64,16 +64,17 @@ class Saved:
         :raises ValueError: if it is damaged, of another version, or of an estimator with other arguments; this one is as it
             was then
         """
-        own = json.loads(json.dumps(self._made_with()))
-        arrays, metadata = read_npz(path, _KIND)
-        if metadata["format"] != FORMAT_VERSION:
+        whole = Path(path).read_bytes()
+        content, digest = whole[:-_DIGEST_SIZE], whole[-_DIGEST_SIZE:]
+        if not content.startswith(_BEGINNING.encode()) or sha256(content).digest() != digest:
+            raise ValueError(f"{path} is damaged, or no state of an estimator: it is not what was saved")
+        line, _, arrays = content.partition(b"\n")
+        described = json.loads(line)
+        if described["format"] != FORMAT_VERSION:
             raise ValueError(
-                f"{path} has format {metadata['format']}, this version reads {FORMAT_VERSION}: begin a discharge anew"
+                f"{path} has format {described['format']}, this version reads {FORMAT_VERSION}: begin a discharge anew"
             )
-        saved: Any = metadata.get("settings")
-        # compiled code takes the arrays as they are
-        if metadata.get("sha256") != _digest(arrays, saved):
-            raise ValueError(f"{path} is damaged: it is not what was saved")
+        saved, own = described["settings"], json.loads(json.dumps(self._made_with()))
         different = sorted(name for name in saved.keys() | own.keys() if saved.get(name) != own.get(name))
         if different:
             name = different[0]
@@ -81,17 +82,5 @@ class Saved:
                 f"{path} is of an estimator with {name} = {saved.get(name)!r}, this one has {own.get(name)!r}: make one with "
                 f"the same arguments (different: {', '.join(different)})"
             )
-        self._restore(arrays)
-
-
-def _digest(arrays: Mapping[str, NDArray[Any]], settings: Any) -> str:
-    """Of settings, and names, types, shapes and contents of arrays; between the fields of records lies what nobody wrote."""
-    digest, parts = sha256(json.dumps(settings, sort_keys=True).encode()), sorted(arrays.items())
-    while parts:
-        name, array = parts.pop()
-        if array.dtype.names:
-            parts += [(f"{name}.{field}", array[field]) for field in array.dtype.names]
-        else:
-            digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
-            digest.update(array.tobytes())
-    return digest.hexdigest()
+        with np.load(BytesIO(arrays), allow_pickle=False) as found:
+            self._restore(dict(found))

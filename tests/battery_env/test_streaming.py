@@ -186,7 +186,7 @@ class TestFiles:
         record = whole.part(0, 800)
         follow(one, record.part(0, 500))
         file = one.save(tmp_path / "state")
-        assert file.name == "state.npz" and one.save(file) == file  # an older state is replaced
+        assert file.name == "state" and one.save(file) == file  # an older state is replaced
         other.load(file)
         assert repr(follow(one, record.part(500, 800))) == repr(follow(other, record.part(500, 800)))
         assert one.soc == other.soc and list(tmp_path.iterdir()) == [file]
@@ -195,6 +195,6 @@ class TestFiles:
         "make_other", [lambda: ExtendedKalmanFilter(mismatch_V=0.05), lambda: PolicyEstimator.pretrained(recorded=True)]
     )
     def test_what_does_not_fit_is_refused(self, make, make_other, tmp_path):
-        file = make().save(tmp_path / "state.npz")
+        file = make().save(tmp_path / "state")
         with pytest.raises(ValueError, match=r"is of an estimator with .*make one with the same arguments"):
             make_other().load(file)
