@@ -192,18 +192,20 @@ class PolicyEstimator(OnlineEstimator):
         :raises ValueError: for invalid values, a temperature, or a policy that takes no stream
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
-        time_s = 0.0
+        time_s = self._samples[-1][0] + dt_s if self._samples else 0.0
+        self._take(time_s, float(voltage_V), float(current_A))
+        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = self._now.tolist(), self._sd
+        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **self._verdict._asdict(), constants=self._found)
+
+    def _take(self, time_s: float, voltage_V: float, current_A: float) -> None:
         if self._samples:
             before_s, _, before_A = self._samples[-1]
-            time_s = before_s + dt_s
-            self._drawn_C += dt_s * before_A
-        self._samples.append((time_s, float(voltage_V), float(current_A)))
+            self._drawn_C += (time_s - before_s) * before_A
+        self._samples.append((time_s, voltage_V, current_A))
         due = int(time_s / self.decision_s + 1e-9)
         # two beside the first one
         if due > self._decisions and len(with_voltage(self._samples, due * self.decision_s).time_s) > 2:
             self._decide(due)
-        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = self._now.tolist(), self._sd
-        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **self._verdict._asdict(), constants=self._found)
 
     def _follow(self, records: Sequence[Record], decision_s: float) -> CalibrationTask:
         # a data set may know its own constants, of which the policy must not learn
@@ -242,23 +244,12 @@ class PolicyEstimator(OnlineEstimator):
         }
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        progress = np.array([self._drawn_C, self._decisions, *self._now])
-        fitted = {} if self._fitted is None else {f"fitted_{name}": each for name, each in self._fitted._asdict().items()}
-        return fitted | {
-            "samples": columns(self._samples),
-            "progress": progress,
-            "action": self._action,
-            "constants": self._constants,
-        }
+        return {"samples": columns(self._samples)}
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        self._samples = list(map(tuple, arrays["samples"].T.tolist()))
-        self._drawn_C, self._decisions = float(arrays["progress"][0]), int(arrays["progress"][1])
-        self._now, self._action = arrays["progress"][2:].copy(), arrays["action"].copy()
-        self._constants = arrays["constants"].copy()
-        names = [f"fitted_{name}" for name in Fitted._fields]
-        self._fitted = Fitted(*(arrays[name] for name in names)) if set(names) <= arrays.keys() else None
-        self._judge()
+        self.reset()
+        for sample in arrays["samples"].T.tolist():
+            self._take(*sample)
 
     def estimate(self, record: Record) -> Estimate:
         """
