@@ -24,6 +24,7 @@ from battery_env.records.samples import Stream
 from battery_env.sensors import SensorErrors
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES, VoltageTask
 from tests.policies import Always
+from tests.sweeps import sweep
 
 AGES = 5
 LOAD = constant(2.0, "current")
@@ -209,8 +210,8 @@ class TestPrior:
         assert found.settled and not early.settled
         assert found.q_mobile == pytest.approx(LeastSquares(mismatch_V=0.05).estimate(whole).q_mobile, rel=0.015)
 
-    @pytest.mark.parametrize("share", [0.3, 1.0])
-    @pytest.mark.parametrize("size", [0.3, 1.0, 2.8, 4.0, 10.0])
+    @pytest.mark.parametrize("share", sweep(1.0, 0.3))
+    @pytest.mark.parametrize("size", sweep(2.8, 0.3, 1.0, 4.0, 10.0))
     def test_a_cell_of_any_size_has_an_answer_and_of_another_one_it_is_not_settled(self, b0006, size, share):
         """Where to start was told from constants that draw less of a charge: the search began at no number."""
         made = simulate(2.0 * size, 6000.0 * size, 0.0, load_unit="current", cut_off_V=2.7)
@@ -219,7 +220,7 @@ class TestPrior:
             estimate = LeastSquares(path=b0006).estimate(until(every_tenth(made), share))
         assert np.isfinite(estimate.q_mobile) and not estimate.settled
 
-    @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+    @pytest.mark.parametrize("share", sweep(0.5, 0.1, 0.9))
     def test_what_the_cell_itself_was_found_to_hold_counts_as_it_is_stated(self, b0006, share):
         whole = load_nasa_discharges("B0005")[80].loaded_part(2.7)
         known, record = LeastSquares(path=b0006).estimate(whole), until(Samples.of(whole), share)

@@ -27,6 +27,7 @@ from battery_env.lab.calibrate import Ahead, calibrated
 from battery_env.policies.pretrained import pretrained_ids
 from battery_env.records import Samples, Stream
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES
+from tests.sweeps import sweep
 
 WRONG_SHARE = 0.05
 COVERED_SD = 3.0
@@ -439,7 +440,7 @@ EVERY_ESTIMATOR = {
 
 
 @pytest.mark.parametrize("make", EVERY_ESTIMATOR.values(), ids=list(EVERY_ESTIMATOR))
-@pytest.mark.parametrize("soc", [0.4, 0.8, 0.93])
+@pytest.mark.parametrize("soc", sweep(0.8, 0.4, 0.93))
 def test_no_estimator_settles_on_a_start_that_is_not_full_and_that_nobody_told(make, soc):
     case = simulated(np.random.default_rng(int(100 * soc)), soc, rest_s=120)
     for record in (case, case.part(119, len(case.time_s))):

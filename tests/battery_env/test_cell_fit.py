@@ -19,6 +19,7 @@ from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.loads import constant as constant_load
 from battery_env.records.discharge import Discharge, load_nasa_discharges
+from tests.sweeps import sweep
 
 FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)
@@ -134,7 +135,7 @@ class TestSimulated:
             voltage(initial_state(cell=flat), cell=flat), abs=0.01
         )
 
-    @pytest.mark.parametrize("soc", [0.9, 0.8])
+    @pytest.mark.parametrize("soc", sweep(0.8, 0.9))
     def test_a_start_that_is_not_full_is_doubted(self, soc, tmp_path):
         current_A = np.append(np.zeros(120), np.full(20_000, 2.0))
         low = [
@@ -161,7 +162,7 @@ class TestSimulated:
 
 class TestRealCells:
 
-    @pytest.mark.parametrize("size", [0.02, 120.0])
+    @pytest.mark.parametrize("size", sweep(120.0, 0.02))
     def test_cells_of_any_size_have_constants(self, b0005_fit, size):
         discharges = load_nasa_discharges("B0005")
         chosen = [discharges[n] for n in (0, 84, -1, 120)]
@@ -180,7 +181,7 @@ class TestRealCells:
             assert np.sqrt(np.mean(error_V**2)) < 1.2 * b0005_fit.mismatch_V
         assert all(f"{1e3 * error_V:.1f} mV\n" in b0005_fit.summary() + "\n" for error_V in shown_V)
 
-    @pytest.mark.parametrize("numbers", [[0], [0, 10, 20], [5, 5, 5]], ids=["one", "young", "copies"])
+    @pytest.mark.parametrize("numbers", sweep([0, 10, 20], [0], [5, 5, 5]), ids=["young", "one", "copies"])
     def test_one_age_says_nothing_of_others(self, numbers, tmp_path):
         discharges = load_nasa_discharges("B0005")
         with pytest.warns(UserWarning, match=r"show one age, .* q_mobile is .* mismatch_V, (48|50) mV, allows"):

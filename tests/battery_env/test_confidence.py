@@ -8,6 +8,7 @@ import pytest
 from battery_env import NEW_CELL, PolicyEstimator, RandomSensorErrors, SensorErrors, evaluate, simulate
 from battery_env.records import Samples
 from battery_env.tasks.data import standard_dataset
+from tests.sweeps import sweep
 
 ENV_ID = "BatteryVoltageJoint-v0"
 OPTIONS = {"nuisance": 0.2, "reading_s": 2.0}
@@ -114,7 +115,7 @@ def test_what_it_is_not_sure_of_is_said(record, options, message):
 STEADY = simulate(np.full(30_000, 2.0), 6000.0, 0.15, load_unit="current", cut_off_V=2.8)
 
 
-@pytest.mark.parametrize("apart_s", [1, 3, 10, 17, 30, 60])
+@pytest.mark.parametrize("apart_s", sweep(10, 1, 3, 17, 30, 60))
 def test_it_reads_where_the_samples_are(apart_s):
     """However far apart, and whether the others are not in the record or have no voltage."""
     noise_V = np.random.default_rng(1).normal(0.0, 0.002, len(STEADY.voltage_V))

@@ -21,6 +21,7 @@ from battery_env.lab.settings import Settings
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
 from battery_env.records import Samples, resample_current
 from battery_env.records.discharge import Discharge
+from tests.sweeps import sweep
 
 TRUTH = Estimate(6000.0, 0.15)
 # short discharges of few steps
@@ -371,8 +372,8 @@ class TestCommand:
         assert main(["forecast", "run_2.5A.csv", "--out", "out"]) == 2
         assert "run_2.5A_forecast.json, out/run_2.5A_forecast.png would be replaced" in capsys.readouterr().err
 
-    @pytest.mark.parametrize("size", [0.05, 0.3, 2.5, 10.0, 100.0])
-    @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
+    @pytest.mark.parametrize("size", sweep(0.3, 0.05, 2.5, 10.0, 100.0))
+    @pytest.mark.parametrize("share", sweep(0.5, 0.25, 0.75))
     def test_a_nominal_capacity_tells_what_a_cell_of_another_size_holds(self, size, share):
         cell = with_equilibrium(NEW_CELL.replace(kn=800.0), [-0.03, 0.02, 0.05])
         made = simulate(2.0 * size, 6800.0 * size, 0.1 / size, load_unit="current", cell=cell, cut_off_V=2.7)
@@ -385,8 +386,8 @@ class TestCommand:
         low_s, _, high_s = forecast_end(seen).eod_quantile_s()
         assert size < 1.0 or share > 0.5 or not low_s < end_s < high_s
 
-    @pytest.mark.parametrize("size", [1.0, 2.5, 5.0, 10.0])
-    @pytest.mark.parametrize("rate", [0.3, 1.0])
+    @pytest.mark.parametrize("size", sweep(5.0, 1.0, 2.5, 10.0))
+    @pytest.mark.parametrize("rate", sweep(1.0, 0.3))
     def test_of_a_larger_cell_that_is_not_stated_the_filter_is_not_sure(self, size, rate):
         surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
         cell = NEW_CELL.replace(q_mobile=6800.0 * size, r_o=0.15 / size, **surfaces)

@@ -27,6 +27,7 @@ from battery_env.loads import Load
 from battery_env.policies.pretrained import file_stem, pretrained_card, pretrained_policy
 from battery_env.records.discharge import BUNDLED_CELLS
 from battery_env.tasks.data import standard_dataset
+from tests.sweeps import sweep
 
 FOLDER = files("battery_env.policies.pretrained_policies")
 #: The one that learned along the path of the bundled cells, by its id and whether it is for recorded cells.
@@ -86,7 +87,7 @@ def test_on_recorded_cells_the_one_for_them_agrees_with_least_squares_and_settle
 class TestWhatIsNotThere:
     """Faults of a record that a policy must not settle on."""
 
-    @pytest.mark.parametrize("share", [0.1, 0.13, 0.145, 0.15, 0.2])
+    @pytest.mark.parametrize("share", sweep(0.145, 0.1, 0.13, 0.15, 0.2))
     def test_rows_lost_down_to_the_last_one(self, share):
         record = load_nasa_discharges("B0005")[30]
         first_s, last_s = record.time_s[record.current_A > 1.0][[0, -1]]
@@ -95,14 +96,14 @@ class TestWhatIsNotThere:
         off = abs(found.q_mobile_C / LeastSquares(mismatch_V=0.05).estimate(record.loaded_part(2.7)).q_mobile - 1.0)
         assert off < 0.02 or not found.settled_q_mobile
 
-    @pytest.mark.parametrize("offset_A", [-0.2, -0.03, 0.01, 0.03, 0.1, 0.2, 0.22])
+    @pytest.mark.parametrize("offset_A", sweep(0.1, -0.2, -0.03, 0.01, 0.03, 0.2, 0.22))
     def test_an_offset_of_the_current_is_in_the_standard_deviation(self, offset_A):
         record = load_nasa_discharges("B0006")[40]
         truth = calibrate(record, method="policy")
         found = calibrate(Discharge(record.time_s, record.voltage_V, record.current_A + offset_A), method="policy")
         assert abs(found.q_mobile_C - truth.q_mobile_C) < 3.0 * found.sd_q_mobile_C
 
-    @pytest.mark.parametrize("load_A", [1.0, 2.0, 4.0])
+    @pytest.mark.parametrize("load_A", sweep(2.0, 1.0, 4.0))
     def test_pulses_whose_noise_is_not_noise(self, load_A):
         _, options = pretrained_policy(*ALONG_A_PATH)
         pulses = Load(np.arange(3000) * 10.0, np.tile([load_A, 0.0], 1500), "current")

@@ -10,6 +10,7 @@ from battery_env.estimators import CellFit, Estimate, ExtendedKalmanFilter, Leas
 from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis, is_only_imprecise
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.records import expected_current
+from tests.sweeps import sweep
 
 CALIBRATORS = {
     "least squares": lambda **more: LeastSquares(**{"thermal": True, "mismatch_V": 0.05, **more}),
@@ -296,13 +297,13 @@ class TestGaps:
     """A charge that nobody saw is stated as a doubt, or noticed."""
 
     @pytest.mark.parametrize("cell", ["B0005", "B0006"])
-    @pytest.mark.parametrize(("from_s", "length_s"), [(400.0, 600.0), (1700.0, 120.0)])
+    @pytest.mark.parametrize(("from_s", "length_s"), sweep((400.0, 600.0), (1700.0, 120.0)))
     def test_rows_that_are_lost_under_load_do_no_harm(self, cell, calibrator, from_s, length_s):
         whole = load_nasa_discharges(cell)[60].loaded_part(2.7)
         estimate, right = calibrator().estimate(lost(whole, from_s, from_s + length_s)), calibrator().estimate(whole)
         assert estimate.settled and estimate.q_mobile == pytest.approx(right.q_mobile, rel=0.01)
 
-    @pytest.mark.parametrize(("every_s", "pause_s"), [(1, 300), (20, 600), (60, 600)])
+    @pytest.mark.parametrize(("every_s", "pause_s"), sweep((20, 600), (1, 300), (60, 600)))
     def test_a_pause_that_was_not_logged_is_noticed(self, calibrator, every_s, pause_s):
         record = discharged(np.concatenate([np.full(1500, 2.0), np.zeros(pause_s), np.full(40_000, 2.0)]), noise_V=0.003)
         time_s, end_s = record.time_s, 1500.0 + pause_s
@@ -322,8 +323,8 @@ class TestGaps:
         estimate = calibrator().estimate(jumped(SOUND["a logger that writes changes"], 1500.0, 300.0))
         assert not estimate.settled and estimate.reason.startswith("No sample lies between 1")
 
-    @pytest.mark.parametrize("first_s", range(0, 300, 50))
-    @pytest.mark.parametrize("every_s", [120, 300])
+    @pytest.mark.parametrize("first_s", sweep(*range(0, 300, 50)))
+    @pytest.mark.parametrize("every_s", sweep(300, 120))
     def test_a_charge_in_doubt_is_a_doubt_of_a_resistance_that_may_make_up_for_it(self, calibrator, every_s, first_s):
         """Rows minutes apart once left an R_o settled that was 5 standard deviations off, in half a discharge."""
         record = discharged(np.append(np.zeros(600), np.full(20_000, 1.5)), noise_V=0.001)
@@ -350,7 +351,7 @@ class TestPrecision:
             assert abs(stated.q_mobile - 6000.0) < 3.0 * stated.sd_q_mobile
             assert stated.sd_r_o == pytest.approx(np.hypot(unstated.sd_r_o, 0.015 * stated.r_o))
 
-    @pytest.mark.parametrize("offset_V", [-0.035, -0.025, -0.02, 0.02, 0.025, 0.035, 0.055])
+    @pytest.mark.parametrize("offset_V", sweep(0.02, -0.035, -0.025, -0.02, 0.025, 0.035, 0.055))
     def test_what_the_voltage_at_rest_is_off_is_an_error_of_the_model(self, calibrator, offset_V):
         """An offset of the sensor went into R_o, settled, which was 15 standard deviations off."""
         seen = replace(WHOLE, voltage_V=WHOLE.voltage_V + offset_V)
@@ -364,7 +365,7 @@ class TestPrecision:
         assert abs(filtered.q_mobile - fitted.q_mobile) < 1.5 * filtered.sd_q_mobile
         assert filtered.settled and 0.5 * fitted.sd_q_mobile < filtered.sd_q_mobile < fitted.sd_q_mobile
 
-    @pytest.mark.parametrize("index", [0, 24, 48])
+    @pytest.mark.parametrize("index", sweep(24, 0, 48))
     def test_a_rest_makes_it_no_surer_of_a_resistance_than_the_error_of_its_model_allows(self, index):
         """With the rest after the cut-off a stream once settled an R_o of half of the right one, 7 standard deviations off."""
         record = load_nasa_discharges("B0005")[index]
@@ -372,7 +373,7 @@ class TestPrecision:
         estimate = CALIBRATORS["filter"]().estimate(record)
         assert abs(estimate.r_o - right.r_o) < 3.0 * estimate.sd_r_o and not estimate.settled_r_o
 
-    @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
+    @pytest.mark.parametrize("share", sweep(0.5, 0.25, 0.75))
     def test_before_the_knee_it_is_no_surer_than_least_squares_with_constants_of_young_discharges(self, young_fit, share):
         """With an error stated too small it answered 4657 +- 84 C at half time; the whole discharge says 5986 C."""
         record = load_nasa_discharges("B0006")[64].loaded_part(2.7)
