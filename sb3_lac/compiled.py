@@ -26,6 +26,9 @@ _NUMBERS = spaces.Box(-math.inf, math.inf, (1,))
 # What sampling leaves behind in an action distribution. The graphs that it belongs to are gone after an update
 _LEFT_BEHIND = ("distribution", "gaussian_actions", "weights_dist", "exploration_mat", "exploration_matrices", "_latent_sde")
 
+# What PyTorch would ask before each use of a graph, and what only changes where code is rewritten while a model trains
+_UNASKED = ("CLOSURE_MATCH", "DICT_NOT_CONTAINS", "DUPLICATE_INPUT", "HASATTR", "NOT_PRESENT_IN_GENERIC_DICT")
+
 # Names and values of what is logged
 Metrics = tuple[tuple[str, ...], th.Tensor]
 
@@ -211,7 +214,8 @@ class CompiledUpdate:
         run.__code__ = run.__code__.replace()
         self._made_from = update, device
         self._on_gpu = device.type == "cuda"
-        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=self._compile)
+        asked = {"guard_filter_fn": lambda guards: [not (g.is_global or g.guard_type in _UNASKED) for g in guards]}
+        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=self._compile, options=asked)
         # One per group of parameters. A number would be a constant of the graph
         self._learning_rates: list[th.Tensor] = []
         self._space: spaces.Space = _NUMBERS
@@ -225,10 +229,15 @@ class CompiledUpdate:
 
     def _compile(self, traced: th.fx.GraphModule, inputs: list[th.Tensor]) -> Callable[..., Sequence[th.Tensor]]:
         """Make code of an update that was traced."""
+        # Takes seconds
         from torch import _dynamo as dynamo
 
+        if BACKEND == "inductor" and not self._on_gpu:
+            from sb3_lac.inductor import compile_for_cpu as compile_graph
+        else:
+            compile_graph = dynamo.lookup_backend(BACKEND)
         print("sb3_lac compiles the update of LAC: this takes half a minute to minutes.", file=sys.stderr, flush=True)
-        graph = Graph(dynamo.lookup_backend(BACKEND)(traced, inputs), self._sampled, self._on_gpu)
+        graph = Graph(compile_graph(traced, inputs), self._sampled, self._on_gpu)
 
         def call(*args: th.Tensor) -> Sequence[th.Tensor]:
             self._graph = graph
