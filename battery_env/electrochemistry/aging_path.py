@@ -15,6 +15,7 @@ from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS, CellParameters, check_cell
 from battery_env.electrochemistry.equilibrium import with_equilibrium
+from battery_env.electrochemistry.model_error import more_errors_per_C
 from battery_env.files import read_json, write_json
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O
 
@@ -32,9 +33,6 @@ BESIDE_LIMIT_SD = 4.0
 #: Cells may be younger and older than those of the path by this share of its length.
 BEYOND_SHARE = 0.2
 
-# The error of the model of a cell at its place drifts as it is discharged: all its charge shows so many independent ones.
-# Chosen on B0005 along the path of B0006.
-_ERRORS_OF_A_DISCHARGE = 100.0
 # How unsure n lives leave what another cell is: standard deviations are 1 + _FEW_LIVES / n times as large. Chosen on B0006
 # along the path of B0005.
 _FEW_LIVES = 2.0
@@ -136,7 +134,7 @@ class AgingPath:
     @property
     def errors_per_C(self) -> float:
         """How many independent errors of the model a coulomb shows, besides a first one."""
-        return _ERRORS_OF_A_DISCHARGE / self.cell.q_mobile
+        return more_errors_per_C("path", self.cell.q_mobile)
 
     @property
     def sd_ratio(self) -> float:

@@ -14,6 +14,7 @@ from battery_env.checks import LoadUnit
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.cell import CellParameters, PackedConstants
 from battery_env.electrochemistry.kernels import BLOCK, BLOCK_SIZE, LOAD, VOLTAGE, fill_block, states_of_block, step_of_block
+from battery_env.electrochemistry.model_error import memory_share
 from battery_env.electrochemistry.simulation import state_of_charge, voltage_into
 
 #: The ends and the middle of the intervals that are shown: nine of ten outcomes lie between the outer two.
@@ -23,9 +24,6 @@ BAND = (0.05, 0.5, 0.95)
 LONGEST_S = 604_800.0
 #: A full cell takes no more charge than this share of its own.
 SURPLUS_SHARE = 0.01
-#: The error of the model drifts with this constant, as a share of ``q_mobile``: it is wrong in another way at another charge.
-#: That is how fast the residuals of whole discharges of B0005 lose their correlation.
-MEMORY_SHARE = 0.15
 # Cells that have ended are left out every so many steps.
 _CHUNK_STEPS = 512
 # Rows of what is followed of cells: what they are, and the sum of their currents, the last current and voltage, and their end.
@@ -54,7 +52,7 @@ class Cells(NamedTuple):
     :param r_o: ohmic resistance, ohm, shape (n,)
     :param state: shape (n, 8)
     :param error_V: by how much a cell is higher than its model, V, shape (n,)
-    :param drift_V: what comes to that in the long run, as charge is drawn (:data:`MEMORY_SHARE`), V, shape (n,)
+    :param drift_V: what comes to that in the long run, as charge is drawn, V, shape (n,)
     """
 
     q_mobile: FloatArray
@@ -127,9 +125,9 @@ def run_down(
         load = np.array([loads[n].mean(starts_s, dt_s) for n in (going.tolist() if len(loads) > 1 else [0])], dtype=np.float64)
         rows = np.arange(-first % every, _CHUNK_STEPS, every) if every else np.arange(0)
         shown_V, part, ahead = np.full((count, len(rows)), cut_off_V), followed.take(going, axis=1), state[going]
-        places, limits = (first, every), (cut_off_V, surplus_share, MEMORY_SHARE)
         part_V = np.full((len(going), len(rows)), cut_off_V)
-        overfull = _run_on(load, part, dt_s, power, model.thermal, model.cell.packed, limits, places, ahead, part_V)
+        run = _Run(dt_s, power, model.thermal, float(cut_off_V), surplus_share, memory_share("forecast"), first, every)
+        overfull = _run_on(load, part, run, model.cell.packed, ahead, part_V)
         if overfull >= 0:
             raise ValueError(
                 f"load charges the cell beyond full, by more than {SURPLUS_SHARE:.0%} of its charge, after "
@@ -158,13 +156,27 @@ def follow(cells: Cells, model: Model, current_A: FloatArray, shown: int) -> tup
     count, state, split = len(cells.q_mobile), cells.state.copy(), len(current_A) - shown
     followed, voltage_V = _followed(cells, np.full(count, np.inf)), np.full((count, shown + 1), np.nan)
     # nobody asks where these end, nor how full they become
-    limits, packed, part_V = (-np.inf, np.inf, MEMORY_SHARE), model.cell.packed, np.full((count, shown), np.nan)
-    for load, every, seen_V in ((current_A[:split], 0, part_V), (current_A[split:], 1, part_V)):
-        _run_on(load[None], followed, model.dt_s, False, model.thermal, packed, limits, (0, every), state, seen_V)
+    packed, part_V = model.cell.packed, np.full((count, shown), np.nan)
+    run = _Run(model.dt_s, False, model.thermal, -np.inf, np.inf, memory_share("forecast"), 0, 0)
+    _run_on(current_A[None, :split], followed, run, packed, state, part_V)
+    _run_on(current_A[None, split:], followed, run._replace(every=1), packed, state, part_V)
     at_end_V = np.empty(count)
     voltage_into(at_end_V, state, cells.q_mobile, packed)
     voltage_V[:, :-1], voltage_V[:, -1] = part_V, at_end_V + cells.error_V
     return cells._replace(state=state), voltage_V
+
+
+class _Run(NamedTuple):
+    """How cells are taken on through some steps."""
+
+    dt_s: float
+    is_power: bool  # whether the load is one, or a current
+    thermal: bool
+    cut_off_V: float
+    surplus_share: float  # how far beyond full a cell may be charged
+    memory_share: float  # over which the error of the model drifts
+    first: int  # the first step
+    every: int  # the voltage is kept at all multiples of so many steps; 0: it is not
 
 
 def _followed(cells: Cells, until: FloatArray) -> FloatArray:
@@ -177,18 +189,14 @@ def _followed(cells: Cells, until: FloatArray) -> FloatArray:
 def _run_on(
     load: FloatArray,
     followed: FloatArray,
-    dt: float,
-    power: bool,
-    thermal: bool,
+    run: _Run,
     packed: PackedConstants,
-    limits: tuple[float, float, float],
-    places: tuple[int, int],
     state: FloatArray,
     shown: FloatArray,
 ) -> int:
     # Take cells on through the steps of ``load``, shape (cells or 1, steps): fills their ends, in steps, and the voltages
     # that are shown. Returns the first step at which a cell is charged beyond full, or -1. After its last step no cell ends
-    (cut_off, surplus, memory), (first, every) = limits, places
+    dt, first, every = run.dt_s, run.first, run.every
     shared, block, overfull = load.shape[0] == 1, np.empty(BLOCK_SIZE), -1
     for start in range(0, state.shape[0], BLOCK):
         cells = going = min(BLOCK, state.shape[0] - start)
@@ -198,7 +206,7 @@ def _run_on(
                 break
             for j in range(cells):
                 block[LOAD * BLOCK + j] = load[0 if shared else start + j, k]
-            step_of_block(block, cells, dt, power, True, thermal, False, packed.polynomial_n, packed.polynomial_p)
+            step_of_block(block, cells, dt, run.is_power, True, run.thermal, False, packed.polynomial_n, packed.polynomial_p)
             for j in range(cells):
                 n = start + j
                 if followed[_END, n] < np.inf:
@@ -207,15 +215,15 @@ def _run_on(
                 volts = block[VOLTAGE + j] + followed[_ERROR, n]
                 if followed[_DRIFT, n] != 0.0:
                     # what the last voltages showed stays, as an error of r_o would; what the error is beside that changes
-                    left = exp(-max(drawn, 0.0) / memory)
+                    left = exp(-max(drawn, 0.0) / run.memory_share)
                     volts += followed[_DRIFT, n] * sqrt(1.0 - left * left)
                 if first + k <= followed[_UNTIL, n]:
                     first_soc, last_V = followed[_FIRST_SOC, n], followed[_LAST_V, n]
-                    if first_soc - drawn > max(first_soc, 1.0) + surplus and (overfull < 0 or first + k < overfull):
+                    if first_soc - drawn > max(first_soc, 1.0) + run.surplus_share and (overfull < 0 or first + k < overfull):
                         overfull = first + k
-                    if not volts > cut_off:
+                    if not volts > run.cut_off_V:
                         # an empty cell has no voltage, and a first one none before
-                        back = (cut_off - volts) / (last_V - volts) if volts < last_V else 0.0
+                        back = (run.cut_off_V - volts) / (last_V - volts) if volts < last_V else 0.0
                         followed[_END, n] = first + k - back
                         followed[_END_SOC, n] = first_soc - drawn
                         if back > 0.0:

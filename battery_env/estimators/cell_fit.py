@@ -16,8 +16,9 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import check_numbers, check_positive
 from battery_env.electrochemistry import CellParameters, check_cell
 from battery_env.electrochemistry.aging_path import AgingPath
-from battery_env.estimators.diagnosis.conditions import BELOW_REST_V, MISMATCH_MARGIN, rest_voltage_V
+from battery_env.estimators.diagnosis.rest import BELOW_REST_V, rest_voltage_V
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.verdict import MISMATCH_MARGIN
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE
 

@@ -8,11 +8,9 @@ import numpy as np
 
 from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, QNS, VO, CellParameters, Trajectory
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis, is_plausible
 from battery_env.estimators.estimator import Estimator
-
-# The charges of the state agree with the current within this share.
-_CHARGE_SHARE = 0.02
+from battery_env.estimators.reasons import SETTLED_SHARES, Reason
+from battery_env.estimators.verdict import Diagnosis, is_plausible
 
 
 class ClosedForm(Estimator):
@@ -42,12 +40,12 @@ class ClosedForm(Estimator):
         negative_C = record.state[-2:, [QNB, QNS]].sum(axis=1)
         moved_C, drawn_C = float(negative_C[0] - negative_C[1]), float(record.current_A[-2]) * record.dt_s
         diagnosis = Diagnosis()
-        diagnosis.note(Condition.NO_CURRENT, bool(np.isnan(r_o)))
-        contradicted = abs(moved_C - drawn_C) > _CHARGE_SHARE * abs(moved_C)
-        diagnosis.note(Condition.CHARGE_DIFFERS, contradicted, moved_C=moved_C, drawn_C=drawn_C)
-        diagnosis.note(Condition.IMPLAUSIBLE, not is_plausible(q_mobile, self.cell))
-        values, sds = {"q_mobile": q_mobile, "r_o": r_o}, {"q_mobile": np.nan, "r_o": np.nan}
-        return Estimate(q_mobile, r_o, **diagnosis.verdict(values, sds)._asdict())
+        diagnosis.note(Reason.NO_CURRENT, bool(np.isnan(r_o)))
+        contradicted = abs(moved_C - drawn_C) > SETTLED_SHARES["q_mobile"] * abs(moved_C)
+        diagnosis.note(Reason.CHARGE_DIFFERS, contradicted, moved_C=moved_C, drawn_C=drawn_C)
+        diagnosis.note(Reason.IMPLAUSIBLE, not is_plausible(q_mobile, self.cell.q_mobile))
+        verdict = diagnosis.verdict({"q_mobile": q_mobile, "r_o": r_o}, {})
+        return Estimate(q_mobile, r_o, **verdict._asdict())
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]
         """One estimate for every step of simulated discharges of at least two samples."""

@@ -21,7 +21,7 @@ from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
 
 # Points between limits keep this far from them, as a share of their distance, so that rounding leaves them within.
-_ROUNDING = 1e-9
+ROUNDING = 1e-9
 
 
 class Estimator(ABC):
@@ -235,5 +235,5 @@ def _room(point: FloatArray, deviation: FloatArray) -> float:
     for n, parameter in enumerate(PARAMETERS.values(), start=STATE_SIZE):
         to_limit = parameter.limits[int(deviation[n] > 0.0)] - point[n]
         if abs(deviation[n]) > abs(to_limit):
-            room = min(room, (1.0 - _ROUNDING) * float(to_limit / deviation[n]))
+            room = min(room, (1.0 - ROUNDING) * float(to_limit / deviation[n]))
     return room

@@ -15,6 +15,7 @@ from battery_env.checks import ZERO_CELSIUS_K, check_positive
 from battery_env.electrochemistry import CellParameters, check_cell, check_dt
 from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
 from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
+from battery_env.electrochemistry.model_error import MORE_ERRORS, independent_errors
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import (
@@ -27,7 +28,7 @@ from battery_env.estimators.cell_fit import (
     groups,
     unseen_of_life,
 )
-from battery_env.estimators.diagnosis.conditions import ABOVE_REST_V, BELOW_REST_V
+from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, BELOW_REST_V
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, spread_over, square
 from battery_env.parameters import Q_MOBILE, R_O
@@ -45,17 +46,17 @@ from battery_env.records.model import RecordModel
 #: How far the equilibrium voltage may be another one: standard deviations of the coefficients of Legendre polynomials 0, 1,
 #: ... over the mole fractions of the positive electrode that a discharge passes through, V.
 EQUILIBRIUM_PRIOR_SD_V: tuple[float, ...] = (0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.05, 0.05)
-#: A fit that is farther from the measured voltages than this (root mean square), V, is refused.
-LIMIT_V = 0.05
+#: A fit that is farther from the measured voltages than this (root mean square), V, is refused: one that was not fitted is
+#: as near.
+LIMIT_V = UNFITTED_MISMATCH_V
 _MOST_DISCHARGES, _FEWEST_SAMPLES = 30, 20
 # Longer records are thinned: what the constants shape is slower.
 _MOST_SAMPLES = 2000
 # Rounds of weighing the residuals by how large they turn out, and how large they are taken for in the first one, V.
 _ROUNDS = 3
-_FIRST_MISMATCH_V, _LEAST_MISMATCH_V = 0.02, 1e-3
-# The error of the model drifts slowly: a discharge shows so many independent ones, unless its residuals change sign more
-# often.
-_INDEPENDENT_ERRORS = 50.0
+_FIRST_MISMATCH_V, LEAST_MISMATCH_V = 0.02, 1e-3
+#: Each discharge shows so many independent errors of the model, unless its residuals change their sign more often.
+INDEPENDENT_ERRORS = independent_errors(1.0, MORE_ERRORS["fit"])
 # The search: how many standard deviations of its prior a constant may move, the logarithm of the distance of q_mobile to its
 # least value, C, and the scale of r_o, ohm.
 _REACH_SD, _LOG_DISTANCE_LIMITS, _R_O_SCALE_OHM = 6.0, (-30.0, 16.0), 0.1
@@ -256,7 +257,7 @@ class JointFit:
 
     def solve(self) -> CellFit:
         """The best fit that is found from any start, with the weights that its residuals imply."""
-        weights = _Weights(_FIRST_MISMATCH_V, np.full(len(self.data), _INDEPENDENT_ERRORS))
+        weights = _Weights(_FIRST_MISMATCH_V, np.full(len(self.data), INDEPENDENT_ERRORS))
         found = [self._search(x, weights) for x in self.starts()]
         best = min(found, key=lambda x: square(self._objective(x, weights)[0]))
         for _ in range(_ROUNDS):
@@ -328,12 +329,12 @@ class JointFit:
         """What the residuals say about their own size, and how many of them are independent."""
         residuals_V = [seen.residual_V for seen in self._evaluated(tuple(x))]
         changes = [float(np.count_nonzero(np.diff(np.signbit(residual)))) for residual in residuals_V]
-        independent = np.maximum(changes, _INDEPENDENT_ERRORS)
+        independent = np.maximum(changes, INDEPENDENT_ERRORS)
         # what was fitted makes residuals smaller than errors, by as much as the data determine
         left = np.diag(self._covariance(x, weights))[: len(self.sd)]
         fitted = float(np.sum(1.0 - left)) + 2.0 * len(residuals_V)
         square_V2 = sum(count * _rms(residual) ** 2 for count, residual in zip(independent, residuals_V, strict=True))
-        return _Weights(max(float(np.sqrt(square_V2 / (independent.sum() - fitted))), _LEAST_MISMATCH_V), independent)
+        return _Weights(max(float(np.sqrt(square_V2 / (independent.sum() - fitted))), LEAST_MISMATCH_V), independent)
 
     def _left_out_V(self, x: FloatArray, weights: _Weights) -> list[float | None]:
         """
@@ -378,14 +379,23 @@ class JointFit:
         after = [getattr(cell, name) for name in RATE_CONSTANTS] + (self.sd * x[:n])[len(RATE_CONSTANTS) :].tolist()
         names = [*RATE_CONSTANTS, *(f"equilibrium {k}" for k in range(len(EQUILIBRIUM_PRIOR_SD_V)))]
         rows = zip(names, before, self.sd.tolist(), after, (self.sd * sds[:n]).tolist(), strict=True)
-        discharges = []
-        left_out_V = self._left_out_V(x, weights)
-        rows_of = zip(self.names, self.before, seen, left_out_V, self.records, strict=True)
-        for d, (name, (_, before_V), at, error_V, record) in enumerate(rows_of):
-            sd_q_C = float(np.sqrt(at.q_gradient_C @ covariance @ at.q_gradient_C))
-            sd_r_ohm = float(_R_O_SCALE_OHM * sds[n + len(seen) + d])
-            others = _rms(at.residual_V), before_V, error_V, mean_current_A(record)
-            discharges.append(FittedDischarge(name, at.q_mobile, at.r_o, sd_q_C, sd_r_ohm, *others))
+        constants = tuple(FittedConstant(name, prior, prior_sd, value, sd) for name, prior, prior_sd, value, sd in rows)
+        discharges = [
+            FittedDischarge(
+                name,
+                at.q_mobile,
+                at.r_o,
+                sd_q_mobile=float(np.sqrt(at.q_gradient_C @ covariance @ at.q_gradient_C)),
+                sd_r_o=float(_R_O_SCALE_OHM * sds[n + len(seen) + d]),
+                rmse_V=_rms(at.residual_V),
+                rmse_before_V=before_V,
+                left_out_V=left_out_V,
+                current_A=mean_current_A(record),
+            )
+            for d, (name, (_, before_V), at, left_out_V, record) in enumerate(
+                zip(self.names, self.before, seen, self._left_out_V(x, weights), self.records, strict=True)
+            )
+        ]
         largest = max(discharges, key=lambda discharge: discharge.q_mobile)
         new = {"q_mobile": largest.q_mobile, "r_o": largest.r_o}
         return CellFit(
@@ -394,7 +404,7 @@ class JointFit:
             self._expected_V(discharges, weights.mismatch_V),
             _rms(np.concatenate([at.residual_V for at in seen])),
             self.model.thermal,
-            tuple(FittedConstant(*row) for row in rows),
+            constants,
             tuple(discharges),
         )
 

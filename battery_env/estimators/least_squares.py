@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot, inf, nan, sqrt
+from math import hypot, nan, sqrt
 from typing import Any
 
 import numpy as np
@@ -15,43 +15,37 @@ from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES, AgingPath
 from battery_env.electrochemistry.ends import LONGEST_S
+from battery_env.electrochemistry.model_error import independent_errors, more_errors_per_C
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.diagnosis.conditions import (
-    EXCESS_LIMIT_UNSTATED,
+from battery_env.estimators.diagnosis.evidence import evidence_of, measured, start_reason, unseen_C
+from battery_env.estimators.diagnosis.faults import RESOLUTION_V
+from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
+from battery_env.estimators.estimator import Estimator, check_bounds
+from battery_env.estimators.reasons import SETTLED_SHARES, Reason
+from battery_env.estimators.search import Fit, JointPrior, Prior, Search, square
+from battery_env.estimators.verdict import (
     MISMATCH_MARGIN,
     MOST_NOISE_SD,
-    MOST_OF_SD,
     PRIOR_LIMIT_SD,
-    SETTLED_SHARES,
     SPARE_SAMPLES,
-    STARTS,
-    Condition,
+    Assumptions,
     Diagnosis,
     Verdict,
     is_plausible,
+    misfit_limit_V2,
     white_noise_V,
 )
-from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
-from battery_env.estimators.diagnosis.samples import note_samples, unseen_C, watched
-from battery_env.estimators.estimator import Estimator, check_bounds
-from battery_env.estimators.search import Fit, JointPrior, Prior, Search, square
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import ChargeHistory, Record, Samples, check_record, drawn_charge_C, history_of
 from battery_env.records.model import RecordModel
 
-# Residuals whose variance is this many of its standard deviations above the one expected are not noise.
-_EXCESS_LIMIT = 5.0
-# Residuals below this are as good as none, V: files are rounded.
-_NEGLIGIBLE_V = 1e-3
 # Noise told from residuals is not below the resolution of a voltmeter, V.
 _LEAST_NOISE_V = 1e-4
 # The effect of the charge at the start is taken over this step.
 _SOC_STEP = 1e-3
 # Starts along a path, in standard deviations of its q_mobile; and how far above what the record allows they keep, as a share.
 _STARTS_SD, _START_ABOVE = (-1.5, -0.5, 0.5, 1.5), 0.02
-# The end of a record agrees with an estimate within this share of its duration.
-_END_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -63,7 +57,7 @@ class _Fitted:
     alone: Fit  # without the prior of q_mobile
     variance_V2: float  # of one residual, with what the error of the model adds
     hidden_sd: Mapping[str, float]  # of what does not show in the voltage, charges that nobody saw among it, by parameter
-    seen: Any  # what the samples show beside the fit
+    evidence: Any  # what the samples show, a row of ``EVIDENCE``
 
     def sd(self, fit: Fit, ratios: Mapping[str, float]) -> dict[str, float]:
         """The standard deviations of a fit, so many times as large as it says, with those of what does not show."""
@@ -98,7 +92,7 @@ class LeastSquares(Estimator):
     both parameters and does not show in the voltage: state it as ``current_gain_sd``.
 
     *Settled* means that the record alone determines every parameter searched for, with a standard deviation below
-    :data:`~battery_env.estimators.diagnosis.conditions.SETTLED_SHARES` of its value without any prior, and that nothing
+    :data:`~battery_env.estimators.reasons.SETTLED_SHARES` of its value without any prior, and that nothing
     contradicts it:
 
     - the record can start with a full cell, or with one of ``initial_soc``, unless ``initial`` is given;
@@ -228,11 +222,12 @@ class LeastSquares(Estimator):
         time_s = whole.time_s
         samples = np.searchsorted(time_s, np.arange(time_s[0] + every_s, time_s[-1], every_s), side="right")
         # the current of a sample shows at the next one
-        fewest = max(len(self.parameters), *np.flatnonzero(whole.current_A)[:1] + 1) + 1
+        fewest = max(len(self.parameters), int((whole.current_A != 0.0).argmax()) + 1) + 1
         stops = np.unique(np.append(samples[samples >= fewest], len(time_s)))
         estimates: list[Estimate] = []
         for stop in stops:
-            estimates.append(self._estimate(whole.first(stop), self._history(record), *estimates[-1:]))
+            previous = estimates[-1] if estimates else None
+            estimates.append(self._estimate(whole.first(stop), self._history(record), previous))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
     def _samples(self, record: Record) -> Samples:
@@ -252,9 +247,9 @@ class LeastSquares(Estimator):
         else:
             search = search.until_empty()
             starts = search.starts([self.model.cell.q_mobile])[0]
-        found = self._fitted(record, search, starts, history)
-        sd = found.sd(found.fit, dict.fromkeys(self.parameters, self._sd_ratio))
-        values, verdict = found.fit.values, self._verdict(record, history, found)
+        fitted = self._fitted(record, search, starts, history)
+        sd = fitted.sd(fitted.fit, dict.fromkeys(self.parameters, self._sd_ratio))
+        values, verdict = fitted.fit.values, self._verdict(record, history, fitted)
         constants = None if self.path is None else {name: values[name] for name in self.nuisance}
         return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict(), constants=constants)
 
@@ -264,8 +259,8 @@ class LeastSquares(Estimator):
         noise_V = self.voltage_noise_V
         if noise_V is None and self.nuisance:  # their priors are weighed against the white part of the residuals
             noise_V = max(white_noise_V(search.residual(dict.fromkeys(self.nuisance, 0.0) | starts[0])[0]), _LEAST_NOISE_V)
-        # so many independent errors of the model a record holds: along a path more than one, as they drift
-        errors = 1.0 if self.path is None else 1.0 + self.path.errors_per_C * drawn_charge_C(record)
+        more_per_C = more_errors_per_C("record", self.model.cell.q_mobile) if self.path is None else self.path.errors_per_C
+        errors = independent_errors(drawn_charge_C(record), more_per_C)
         mismatch_V = sqrt(n / errors) * self.mismatch_V
         weight_V = hypot(noise_V or 0.0, mismatch_V)
         priors: list[Prior | JointPrior] = [Prior(name, 0.0, weight_V / sd) for name, sd in self.nuisance.items()]
@@ -286,15 +281,15 @@ class LeastSquares(Estimator):
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance_V2) / sd_C)
             fit = search.best([*starts, alone.values, *search.starts([mean_C])[0]], [*priors, carried])
-        seen = self._seen(record, history, fit)
-        return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit, unseen_C(seen)), seen)
+        evidence = self._evidence(record, history, fit)
+        return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit, unseen_C(evidence)), evidence)
 
-    def _seen(self, record: Samples, history: ChargeHistory, fit: Fit) -> Any:
-        """What the samples of a record show beside a fit, whose model may be empty before they end."""
+    def _evidence(self, record: Samples, history: ChargeHistory, fit: Fit) -> Any:
+        """What the samples of a record show, with a fit, whose model may be empty before they end."""
         model_V = np.full(len(record.time_s), nan)
         model_V[: len(fit.residual_V)] = record.voltage_V[: len(fit.residual_V)] + fit.residual_V
         estimate = [fit.values[name] for name in PARAMETER_NAMES]
-        return watched(record, self.model.cell, self.initial_soc[0] if self._at_rest else None, estimate, history, model_V)
+        return evidence_of(record, self.model.cell, self.initial_soc[0] if self._at_rest else None, estimate, history, model_V)
 
     def _hidden_sd(self, search: Search, fit: Fit, unseen_C: float) -> dict[str, float]:
         """
@@ -324,64 +319,58 @@ class LeastSquares(Estimator):
             for n, name in enumerate(self.parameters)
         }
 
-    def _verdict(self, record: Samples, history: ChargeHistory, found: _Fitted) -> Verdict:
+    def _verdict(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> Verdict:
         """What speaks against an estimate."""
-        fit, alone, cell, diagnosis = found.fit, found.alone, self.model.cell, Diagnosis()
-        n, free, q_mobile = len(fit.residual_V), self.parameters, fit.values["q_mobile"]
-        own, moved_V2 = found.sd(alone, {"q_mobile": self._sd_ratio}), fit.square_V2 - alone.square_V2
-        unknown = [name for name in free if not own[name] < SETTLED_SHARES[name] * alone.values[name]]
-        unsettled_sd_C = own["q_mobile"] if "q_mobile" in unknown else inf
-        note_samples(diagnosis, found.seen, self.initial_soc[0], record, history, unsettled_sd_C)
-        diagnosis.note(Condition.EMPTY, n < len(record.time_s))
-        if self.voltage_noise_V is None:
-            noise_V, excess = white_noise_V(fit.residual_V), EXCESS_LIMIT_UNSTATED / sqrt(n)
-            few = n < len(free) + SPARE_SAMPLES
-            diagnosis.note(Condition.FEW, few, of="samples", or_else=", or state voltage_noise_V")
-        else:
-            noise_V, excess = self.voltage_noise_V, _EXCESS_LIMIT * sqrt(2.0 / n)
-        limit_V2 = noise_V**2 * (1.0 + excess) + (MISMATCH_MARGIN * self.mismatch_V) ** 2 + _NEGLIGIBLE_V**2
-        diagnosis.note(Condition.MISFIT, square(fit.residual_V) > n * limit_V2)
-        rmse_V, starts = sqrt(square(alone.residual_V) / n), diagnosis.measured.keys() & STARTS
-        if starts and self.mismatch_V and rmse_V**2 > limit_V2:
-            rmse = {"rmse_mV": 1e3 * rmse_V, "mismatch_mV": 1e3 * self.mismatch_V}
-            diagnosis.note(Condition.OTHER_KIND, **rmse, **diagnosis.measured[min(starts)])
-        diagnosis.note(Condition.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, cell))
-        _note_end(diagnosis, record, found, max(2.0 * self.mismatch_V, MOST_NOISE_SD * noise_V, _NEGLIGIBLE_V))
+        fit, alone, evidence, (soc, sd_soc) = fitted.fit, fitted.alone, fitted.evidence, self.initial_soc
+        of_cell, ratio = {"of_cell_mohm": 1e3 * self.cell_sd_r_o_ohm}, {"q_mobile": self._sd_ratio}
+        diagnosis = Diagnosis(evidence, measured(evidence, soc, float(record.time_s[0]), history.charge) | of_cell)
+        n, free, own, is_stated = (
+            len(fit.residual_V),
+            self.parameters,
+            fitted.sd(alone, ratio),
+            self.voltage_noise_V is not None,
+        )
+        diagnosis.note(Reason.EMPTY, n < len(record.time_s))
+        few = not is_stated and n < len(free) + SPARE_SAMPLES
+        diagnosis.note(Reason.FEW, few, of="samples", or_else=", or state voltage_noise_V")
+        noise_V = self.voltage_noise_V or white_noise_V(fit.residual_V)
+        limit_V2 = misfit_limit_V2(noise_V, n, self.mismatch_V, is_stated)
+        diagnosis.note(Reason.MISFIT, square(fit.residual_V) > n * limit_V2)
+        rmse_V = sqrt(square(alone.residual_V) / n)
+        is_other = bool(start_reason(evidence) and self.mismatch_V and rmse_V**2 > limit_V2)
+        diagnosis.note(Reason.OTHER_KIND, is_other, rmse_mV=1e3 * rmse_V, mismatch_mV=1e3 * self.mismatch_V)
+        q_mobile = fit.values["q_mobile"]
+        diagnosis.note(Reason.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, self.model.cell.q_mobile))
+        _note_end(diagnosis, record, fitted, max(MISMATCH_MARGIN * self.mismatch_V, MOST_NOISE_SD * noise_V, RESOLUTION_V))
         if self.path is not None:
             distance = self.path.distance_sd(fit.values)
-            diagnosis.note(Condition.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)
-            diagnosis.note(Condition.PATH_UNTESTED, "q_mobile" in unknown)
-        diagnosis.note(Condition.Q_PRIOR_WRONG, moved_V2 > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * found.variance_V2)
-        diagnosis.note(Condition.Q_PRIOR_ALONE, "q_mobile" in unknown and self.prior_q_mobile_C is not None)
+            diagnosis.note(Reason.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)
+        moved_V2 = fit.square_V2 - alone.square_V2
+        diagnosis.note(Reason.Q_PRIOR_WRONG, moved_V2 > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance_V2)
         for name in fit.at_bound:
-            diagnosis.note(Condition.Q_AT_BOUND.of(name))
-        of_cell_mohm, most_ohm = 1e3 * self.cell_sd_r_o_ohm, MOST_OF_SD * own["r_o"]
-        is_of_cell = "r_o" in unknown and self.cell_sd_r_o_ohm > most_ohm
-        diagnosis.note(Condition.R_OF_CONSTANTS, is_of_cell, of_cell_mohm=of_cell_mohm)
-        for name in unknown:
-            sd_soc = self.initial_soc[1] / self.initial_soc[0] if name == "q_mobile" else 0.0
-            scaled = hypot(self.current_gain_sd, sd_soc) >= SETTLED_SHARES[name]
-            diagnosis.note(Condition.Q_SCALE_UNKNOWN.of(name), scaled)
-            diagnosis.note(Condition.Q_IMPRECISE.of(name))
-        return diagnosis.verdict(alone.values, own)
+            diagnosis.note(Reason.Q_AT_BOUND.of(name))
+        priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
+        known = Assumptions(self.current_gain_sd, sd_soc / soc, self.cell_sd_r_o_ohm, self.path is not None)
+        return diagnosis.verdict(alone.values, own, free, priors, known)
 
 
-def _note_end(diagnosis: Diagnosis, record: Samples, found: _Fitted, deviation_V: float) -> None:
+def _note_end(diagnosis: Diagnosis, record: Samples, fitted: _Fitted, deviation_V: float) -> None:
     """Note where the model comes as low as the record did much earlier or later than the record."""
-    values, (time_s, voltage_V, current_A) = found.fit.values, record
+    values, (time_s, voltage_V, current_A) = fitted.fit.values, record
     n = int(voltage_V.argmin())
     load_A = float(current_A[max(n - 1, 0) : n + 1].max())
     # at rest, with whatever current a sensor shows then, no voltage is reached
     if n == 0 or load_A * LONGEST_S <= values["q_mobile"]:
         return
-    estimate, model = Estimate(values["q_mobile"], values["r_o"]), found.search.model_at(values)
+    estimate, model = Estimate(values["q_mobile"], values["r_o"]), fitted.search.model_at(values)
     until, lowest_V = record.first(n + 1), float(voltage_V[n]) - values.get("offset_V", 0.0)
     forecast = model.forecast(until, estimate, lowest_V, load_A)
     early_s, late_s = (forecast.reached_s(lowest_V + sign * deviation_V) for sign in (1.0, -1.0))
-    allowed_s = _END_SHARE * (time_s[n] - time_s[0]) + 2.0 * model.dt_s
+    # the end of a record agrees with an estimate as nearly as a q_mobile that is settled
+    allowed_s = SETTLED_SHARES["q_mobile"] * (time_s[n] - time_s[0]) + 2.0 * model.dt_s
     agrees = early_s - allowed_s <= time_s[n] <= late_s + allowed_s
     model_s = early_s if early_s > time_s[n] else late_s
-    diagnosis.note(Condition.OTHER_END, not agrees, lowest_V=voltage_V[n], end_s=time_s[n], model_end_s=model_s)
+    diagnosis.note(Reason.OTHER_END, not agrees, lowest_V=voltage_V[n], end_s=time_s[n], model_end_s=model_s)
 
 
 def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) -> dict[str, float]:

@@ -20,9 +20,9 @@ from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.cell import TB
 from battery_env.electrochemistry.ends import quantile
 from battery_env.estimates import Estimate, last_estimate
+from battery_env.estimators.diagnosis.evidence import evidence_of, fault_reason, start_reason
 from battery_env.estimators.diagnosis.gaps import doubtful_C
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
-from battery_env.estimators.diagnosis.samples import fault_condition, start_condition, watched
 from battery_env.estimators.estimator import ModelNow
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.lab.forecast import Forecast, forecast
@@ -32,7 +32,7 @@ from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.policies.estimator import PolicyEstimator
-from battery_env.records import ExpectedCurrent, Samples, drawn, expected_current, history_of, mean_current_A
+from battery_env.records import STEADY_S, ExpectedCurrent, Samples, drawn, expected_current, history_of, mean_current_A
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
@@ -42,8 +42,6 @@ _MANY_SAMPLES = 100_000
 _MODEL_STEP_S = 1.0
 # What is drawn after the cut-off is worth a word if it is more than this share of what was drawn before.
 _MORE_SHARE = 0.2
-# Without a load for longer than this a discharge is over, or pauses.
-_REST_S = 60.0
 # The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
 # 0.1 %. What is farther off than this is another cell, load or chamber than these.
 _WARMTH_LIMIT_K = 20.0
@@ -221,7 +219,7 @@ def _estimate(
     """
     methods: list[Method] = [settings.method or "least-squares"]
     # under other loads the filter, which takes the error of the model for noise, is surer than it may be
-    is_over = float(seen.discharge.time_s[-1] - seen.loaded.time_s[-1]) > _REST_S
+    is_over = float(seen.discharge.time_s[-1] - seen.loaded.time_s[-1]) > STEADY_S
     goes_on = settings.future_current_A is None and load is None and not seen.load.varied and not is_over
     is_new = settings.prior_q_mobile_C is None and settings.cell is None
     if settings.method is None and seen.in_progress and goes_on and is_new:
@@ -340,7 +338,7 @@ def _cell_at_the_temperature(record: Discharge, settings: Settings) -> CellParam
 def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cut_off_V: float) -> float:
     """What is drawn after the cut-off, if that is more than a discharge leaves behind: then it was not the end."""
     if np.isnan(eod_time_s):
-        if discharge.time_s[-1] - loaded.time_s[-1] > _REST_S:
+        if discharge.time_s[-1] - loaded.time_s[-1] > STEADY_S:
             warnings.warn(
                 f"the load ends at {loaded.voltage_V[-1]:.4g} V, above the cut-off of {cut_off_V:g} V, so that the capacity "
                 "is not known: if the cell was discharged no further, state cut_off_V (--cut-off)",
@@ -366,10 +364,10 @@ def _is_all_logged(seen: _Seen, forecast: VoltageForecast, estimate: Estimate) -
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
     record, history, parameters = Samples.of(seen.record), history_of(seen.record), (estimate.q_mobile, estimate.r_o)
-    shown = watched(record, seen.cell, seen.start.soc, parameters, history, forecast.at_samples_V)
+    shown = evidence_of(record, seen.cell, seen.start.soc, parameters, history, forecast.at_samples_V)
     # a charge that tapered off fills any cell, whatever its voltage at rest
     is_lower = shown["start"]["first_V"] < shown["start_V"] and not (history.charge and history.charge.tapered)
-    return not (fault_condition(shown) or (is_lower and start_condition(shown)) or doubtful_C(shown))
+    return not (fault_reason(shown) or (is_lower and start_reason(shown)) or doubtful_C(shown))
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:

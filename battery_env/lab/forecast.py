@@ -14,8 +14,8 @@ from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_not_negative, 
 from battery_env.electrochemistry import NEW_CELL, voltage
 from battery_env.electrochemistry.ends import BAND, Cells, Ends, follow, quantile, run_down
 from battery_env.estimates import Estimate
-from battery_env.estimators.diagnosis.conditions import white_noise_V
 from battery_env.estimators.estimator import ModelNow
+from battery_env.estimators.verdict import white_noise_V
 from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, LoadToCome, RandomLoad, known_load, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records import CUT_OFF_V, Record, Samples, check_record, expected_current

@@ -20,8 +20,8 @@ from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.ends import BAND, quantile
-from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.reasons import is_only_imprecise
 from battery_env.lab.forecast import WHOLE_ERROR
 from battery_env.loads import Load, LoadToCome
 from battery_env.records import VARIED_SHARE, drawn, mean_current_A

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
+from battery_env.estimators.reasons import SETTLED_SHARES
 from battery_env.lab.forecast import Forecast, decimals
 from battery_env.lab.settings import Settings
 from battery_env.parameters import PARAMETERS

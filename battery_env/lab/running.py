@@ -14,8 +14,8 @@ import pandas as pd
 
 from battery_env.checks import LoadUnit
 from battery_env.electrochemistry.ends import BAND, quantile
-from battery_env.estimators.diagnosis.conditions import is_only_imprecise
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.reasons import is_only_imprecise
 from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.lab.calibrate import Ahead, calibrated
 from battery_env.lab.forecast import Forecast, decimals

@@ -13,10 +13,10 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
-from battery_env.estimators.diagnosis.conditions import Condition
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.kalman.filter import PRIOR_SD_SHARE_Q, ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.reasons import Reason
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.records import CUT_OFF_V
@@ -160,7 +160,7 @@ class Settings:
         if low_A / _SAME_LOAD <= current_A <= high_A * _SAME_LOAD:
             return ""
         fitted = f"{low_A:.3g}" if low_A == high_A else f"{low_A:.3g} to {high_A:.3g}"
-        return Condition.OTHER_LOAD.said({"load_A": current_A, "fitted": fitted})
+        return Reason.OTHER_LOAD.said({"load_A": current_A, "fitted": fitted})
 
     def tells_new_capacity(self, current_A: float) -> bool:
         """Whether the constants tell what a new cell yields under a load: where they were fitted to this load alone."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, sqrt
+from math import hypot
 
 import numpy as np
 
@@ -10,20 +10,21 @@ from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, AgingPath, cell_with
 from battery_env.estimates import Estimate
-from battery_env.estimators.diagnosis.conditions import (
-    EXCESS_LIMIT_UNSTATED,
+from battery_env.estimators.diagnosis.evidence import evidence_of, measured, unseen_C
+from battery_env.estimators.diagnosis.rest import rest_voltage_V
+from battery_env.estimators.estimator import ROUNDING
+from battery_env.estimators.reasons import SETTLED_SHARES, Reason
+from battery_env.estimators.search import square
+from battery_env.estimators.verdict import (
     MISMATCH_MARGIN,
-    SETTLED_SHARES,
+    MOST_NOISE_SD,
     SPARE_SAMPLES,
-    Condition,
+    Assumptions,
     Diagnosis,
     Verdict,
-    rest_voltage_V,
-    start_measured,
+    misfit_limit_V2,
     white_noise_V,
 )
-from battery_env.estimators.diagnosis.samples import note_samples, unseen_C, watched
-from battery_env.estimators.search import square
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import ChargeHistory, Samples
 from battery_env.records.model import RecordModel
@@ -31,11 +32,7 @@ from battery_env.tasks.voltage.fit import REACH_SD, Fitted
 from battery_env.tasks.voltage.task import ESTIMATE_RANGES, VoltageTask
 
 # Residuals below this may be what a linear step leaves, V
-_NEGLIGIBLE_V = 2e-3
-# That a constant is at its limit is a matter of rounding
-_NEARLY = 1.0 - 1e-9
-# The first voltage may be this many standard deviations of noise and model, and the largest offset, beyond that of a full cell
-_NOISES = 3.0
+_LINEAR_STEP_V = 2e-3
 # An offset may be this many times the bound that it was trained with
 _OFFSET_MARGIN = 2.0
 
@@ -75,42 +72,38 @@ class Confidence:
         distance of the estimate from it and the charge that nobody saw, shape (2,). What is known of the parameters before
         settles nothing.
         """
-        diagnosis, cell, (q_mobile, r_o) = Diagnosis(), self._cell, estimate.tolist()
+        cell, (q_mobile, r_o), path = self._cell, estimate.tolist(), self._path
         model_V = self._model_V(fitted, n, record)
-        seen = watched(record, cell, 1.0, (q_mobile, r_o), history, model_V)
-        hidden = np.hypot([unseen_C(seen), 0.0], fitted.estimate[n] - estimate)
+        evidence = evidence_of(record, cell, 1.0, (q_mobile, r_o), history, model_V)
+        diagnosis = Diagnosis(evidence, measured(evidence, 1.0, float(record.time_s[0]), history.charge))
+        hidden = np.hypot([unseen_C(evidence), 0.0], fitted.estimate[n] - estimate)
         sd = np.hypot(fitted.sd_alone[n] * [self._sd_ratio, 1.0], hidden)
         is_measured = np.isfinite(record.voltage_V)
         residual_V = (model_V - record.voltage_V)[is_measured]  # NaN after the model is empty
         white_V = white_noise_V(residual_V[np.isfinite(residual_V)])
         readings, offset_V = len(residual_V), abs(float(fitted.offset_V[n]))
-        first_V, full_V = float(record.voltage_V[0]), rest_voltage_V(cell)
-        mismatch_V = 0.0 if self._path is None else MISMATCH_MARGIN * self._path.mismatch_V
-        is_above = first_V > full_V + self._offset_V + _NOISES * sqrt(white_V**2 + mismatch_V**2)
-        diagnosis.note(Condition.START_ABOVE, is_above, **start_measured(first_V, full_V))
-        note_samples(diagnosis, seen, 1.0, record, history, inf if sd[0] < SETTLED_SHARES["q_mobile"] * q_mobile else sd[0])
-        diagnosis.note(Condition.FEW, readings < len(self._parameters) + SPARE_SAMPLES, of="readings", or_else="")
-        limit_V2 = (1.0 + EXCESS_LIMIT_UNSTATED / sqrt(readings)) * white_V**2 + _NEGLIGIBLE_V**2
-        limit_V2 += mismatch_V**2
-        diagnosis.note(Condition.UNEXPLAINED, not square(residual_V) <= readings * limit_V2)
+        mismatch_V = 0.0 if path is None else path.mismatch_V
+        # the first voltage may be that of a full cell with the largest offset, and noise and model beyond
+        beyond_V = self._offset_V + MOST_NOISE_SD * hypot(white_V, MISMATCH_MARGIN * mismatch_V)
+        diagnosis.note(Reason.START_ABOVE, float(record.voltage_V[0]) > rest_voltage_V(cell) + beyond_V)
+        diagnosis.note(Reason.FEW, readings < len(self._parameters) + SPARE_SAMPLES, of="readings", or_else="")
+        limit_V2 = misfit_limit_V2(white_V, readings, mismatch_V, negligible_V=_LINEAR_STEP_V)
+        diagnosis.note(Reason.UNEXPLAINED, not square(residual_V) <= readings * limit_V2)
         is_off = offset_V > _OFFSET_MARGIN * self._offset_V
-        diagnosis.note(Condition.OFFSET, is_off, offset_mV=1e3 * offset_V, most_mV=1e3 * self._offset_V)
-        if self._path is None:
-            diagnosis.note(Condition.CONSTANTS, fitted.constants_sd[n] > _NEARLY * REACH_SD)
-        else:
-            distance = float(fitted.constants_sd[n])
-            diagnosis.note(Condition.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)
-            diagnosis.note(Condition.PATH_UNTESTED, not sd[0] < SETTLED_SHARES["q_mobile"] * q_mobile)
-        differs = np.abs(fitted.estimate[n] / estimate - 1.0)
-        for name in self._parameters:
-            k, share = PARAMETER_NAMES.index(name), SETTLED_SHARES[name]
-            diagnosis.note(Condition.Q_AT_BOUND.of(name), estimate[k] in ESTIMATE_RANGES[name])
-            diagnosis.note(Condition.Q_DIFFERS.of(name), not differs[k] < share, differs=differs[k])
-            diagnosis.note(Condition.Q_IMPRECISE.of(name), not sd[k] < share * estimate[k])
+        diagnosis.note(Reason.OFFSET, is_off, offset_mV=1e3 * offset_V, most_mV=1e3 * self._offset_V)
+        distance = float(fitted.constants_sd[n])
+        diagnosis.note(Reason.CONSTANTS, path is None and distance > (1.0 - ROUNDING) * REACH_SD)
+        diagnosis.note(Reason.BESIDE_PATH, path is not None and distance > BESIDE_LIMIT_SD, distance=distance)
+        differs = np.abs(fitted.estimate[n] / estimate - 1.0).tolist()
+        for k, name in enumerate(PARAMETER_NAMES):
+            if name in self._parameters:
+                diagnosis.note(Reason.Q_AT_BOUND.of(name), estimate[k] in ESTIMATE_RANGES[name])
+                is_apart = not differs[k] < SETTLED_SHARES[name]
+                diagnosis.note(Reason.Q_DIFFERS.of(name), is_apart, **{f"differs_{name}": differs[k]})
         values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
-        known = [name not in self._parameters for name in PARAMETER_NAMES]
-        stated = np.where(known, np.nan, np.hypot(self._sd_ratio * fitted.sd[n], hidden))
-        return diagnosis.verdict(values, sds), stated
+        verdict = diagnosis.verdict(values, sds, self._parameters, known=Assumptions(is_along_path=path is not None))
+        held = [name not in self._parameters for name in PARAMETER_NAMES]
+        return verdict, np.where(held, np.nan, np.hypot(self._sd_ratio * fitted.sd[n], hidden))
 
 
 def _by_name(fitted: Fitted, n: int) -> dict[str, float]:

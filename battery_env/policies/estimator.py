@@ -18,11 +18,12 @@ from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
 from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.estimates import last_estimate
-from battery_env.estimators.diagnosis.conditions import Condition, Verdict
 from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.estimators.reasons import Reason
+from battery_env.estimators.verdict import Verdict
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
-from battery_env.policies.readings import columns, on_grid, with_voltage
+from battery_env.policies.stream import columns, on_grid, with_voltage
 from battery_env.records import (
     ChargeHistory,
     Samples,
@@ -41,7 +42,7 @@ from battery_env.tasks.voltage.task import VoltageTask
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
 # Of a decision that is not judged.
-_NOT_JUDGED = Verdict(False, False, Condition.NOT_YET.text)
+_NOT_JUDGED = Verdict(False, False, Reason.NOT_YET.text)
 
 
 class Predictor(Protocol):
@@ -159,7 +160,7 @@ class PolicyEstimator(OnlineEstimator):
     def _judge(self) -> None:
         """Tell how sure the estimate is, of the samples up to the last decision."""
         self._sd, self._found = [nan, nan], None
-        self._verdict = Verdict(False, False, Condition.NO_FIT.text) if self._confidence is None else _NOT_JUDGED
+        self._verdict = Verdict(False, False, Reason.NO_FIT.text) if self._confidence is None else _NOT_JUDGED
         if self._confidence is not None and self._fitted is not None:
             samples = with_voltage(self._samples, self._decisions * self.decision_s)
             self._verdict, sd = self._confidence.verdict(self._fitted, 0, self._now, samples, ChargeHistory())
@@ -265,7 +266,7 @@ class PolicyEstimator(OnlineEstimator):
             return last_estimate(trace)
         first = 0 if self.task_class.is_averaged else -1
         q_mobile, r_o = (float(values[first:].mean()) for values in (trace.q_mobile, trace.r_o))
-        return Estimate(q_mobile, r_o, settled=False, reason=Condition.NO_FIT.text)
+        return Estimate(q_mobile, r_o, settled=False, reason=Reason.NO_FIT.text)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """The estimates over time of many discharges, run as one batch, in their order."""

@@ -6,6 +6,7 @@ from battery_env.records.history import history_of as history_of
 from battery_env.records.load import LEAST_LOAD_SHARE as LEAST_LOAD_SHARE
 from battery_env.records.load import LOAD_SHARE as LOAD_SHARE
 from battery_env.records.load import REST_CURRENT_A as REST_CURRENT_A
+from battery_env.records.load import STEADY_S as STEADY_S
 from battery_env.records.load import SWITCH_SHARE as SWITCH_SHARE
 from battery_env.records.load import VARIED_SHARE as VARIED_SHARE
 from battery_env.records.load import ExpectedCurrent as ExpectedCurrent

@@ -23,6 +23,8 @@ SWITCH_SHARE = 0.1
 VARIED_SHARE = 0.05
 #: A cell whose current is below this rests, A.
 REST_CURRENT_A = 0.02
+#: After so long under a steady current, or at rest, a voltage goes on as before, s.
+STEADY_S = 60.0
 #: Currents below this share of the largest are taken for noise or sensor offset.
 LEAST_LOAD_SHARE = 0.03
 # What draws no more than this share of the charge before or after the main load is noise, or an offset.

@@ -8,8 +8,8 @@ import pytest
 
 from battery_env import Discharge, Settings, calibrate, load_nasa_discharges, read_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
+from battery_env.estimators.diagnosis.evidence import evidence_of, fault_reason, unseen_C
 from battery_env.estimators.diagnosis.gaps import doubtful_C
-from battery_env.estimators.diagnosis.samples import fault_condition, unseen_C, watched
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.records import ChargeBefore, ChargeHistory, Samples, Stream
 from battery_env.records.load import switched_sd_C
@@ -231,8 +231,8 @@ class TestGaps:
         model_V = 3.3 - np.repeat(np.cumsum(fall_V), 12)
         wander_V = 8e-4 * np.repeat(np.random.default_rng(0).choice([0.0, 1.0], 30), 12)
         record = Samples(time_s, model_V + wander_V, np.full(360, 4.4))
-        seen = watched(record, NEW_CELL, None, (3900.0, 0.03), ChargeHistory(), model_V)
-        assert not doubtful_C(seen) and not fault_condition(seen)
+        seen = evidence_of(record, NEW_CELL, None, (3900.0, 0.03), ChargeHistory(), model_V)
+        assert not doubtful_C(seen) and not fault_reason(seen)
 
 
 class TestSwitches:
@@ -252,5 +252,7 @@ class TestSwitches:
         counted = replace(pulsed, history=ChargeHistory(is_counted=True))
         # but of the moment at which the load came on
         assert pulsed.unseen_C > 0.02 * pulsed.charge_C and 0.0 < counted.unseen_C < 0.02 * pulsed.unseen_C
-        sure, unsure = (watched(Samples.of(each), NEW_CELL, 1.0, (6000.0, 0.1), each.history) for each in (counted, pulsed))
+        sure, unsure = (
+            evidence_of(Samples.of(each), NEW_CELL, 1.0, (6000.0, 0.1), each.history) for each in (counted, pulsed)
+        )
         assert unseen_C(unsure) == pytest.approx(np.hypot(unseen_C(sure), pulsed.unseen_C), rel=0.01)

@@ -7,8 +7,8 @@ import pytest
 
 from battery_env import NEW_CELL, Discharge, ExtendedKalmanFilter, SensorErrors, TrajectoryDataset, simulate
 from battery_env.estimates import EstimateTrace
-from battery_env.estimators.diagnosis.conditions import SETTLED_SHARES
 from battery_env.estimators.estimator import OnlineEstimator
+from battery_env.estimators.reasons import SETTLED_SHARES
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise
 

@@ -7,7 +7,8 @@ import pytest
 
 from battery_env import NEW_CELL, Discharge, RecordModel, initial_state, load_nasa_discharges, simulate
 from battery_env.estimators import CellFit, Estimate, ExtendedKalmanFilter, LeastSquares, fit_cell
-from battery_env.estimators.diagnosis.conditions import Condition, Diagnosis, is_only_imprecise
+from battery_env.estimators.reasons import Reason, is_only_imprecise
+from battery_env.estimators.verdict import Assumptions, Diagnosis
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.records import expected_current
 from tests.sweeps import sweep
@@ -197,28 +198,31 @@ def test_each_reason_is_said_of_its_record(case, name, record, arguments, reason
 
 
 def test_the_table_decides_what_is_said_first_whoever_notes_it():
-    diagnosis, values = Diagnosis(), {"q_mobile": 6000.0, "r_o": 0.1}
-    one_sd, six_sd = {"q_mobile": 240.0, "r_o": 0.06}, {"q_mobile": 240.0, "r_o": 0.18}
-    assert diagnosis.verdict(values, one_sd) == (True, True, "")
-    diagnosis.note(Condition.Q_IMPRECISE.of("r_o"))
-    diagnosis.note(Condition.MISFIT, False)
-    q_settled, r_o_settled, reason = diagnosis.verdict(values, one_sd)
-    assert q_settled and not r_o_settled and reason == Condition.R_IMPRECISE.text
+    values, gain = {"q_mobile": 6000.0, "r_o": 0.1}, Assumptions(gain_sd=0.03)
+
+    def verdict(diagnosis, share_q, share_r_o, known=None):
+        sds = {"q_mobile": share_q * values["q_mobile"], "r_o": share_r_o * values["r_o"]}
+        return diagnosis.verdict(values, sds, ["q_mobile", "r_o"], known=known)
+
+    assert verdict(Diagnosis(), 0.01, 0.2) == (True, True, "")
+    assert verdict(Diagnosis(), 0.01, 0.6) == (True, False, Reason.R_IMPRECISE.text)
+    assert Diagnosis().verdict(values, {}) == (True, True, "")  # of numbers that are held nothing is said
     # that of the number that is farther beyond its limit
-    diagnosis.note(Condition.Q_SCALE_UNKNOWN)
-    texts = [Condition.Q_SCALE_UNKNOWN.text, Condition.R_IMPRECISE.text]
-    assert diagnosis.verdict(values, one_sd) == (False, False, " ".join(texts))
-    assert diagnosis.verdict(values, six_sd).reason == " ".join(reversed(texts))
+    texts = [Reason.Q_SCALE_UNKNOWN.text, Reason.R_IMPRECISE.text]
+    assert verdict(Diagnosis(), 0.04, 0.5, gain) == (False, False, " ".join(texts))
+    assert verdict(Diagnosis(), 0.04, 0.7, gain).reason == " ".join(reversed(texts))
     assert is_only_imprecise(" ".join(texts)) and is_only_imprecise(texts[0]) and not is_only_imprecise(f"{texts[0]} No.")
     # one against both hides what is against one
-    diagnosis.note(Condition.RISES, size=0.1, fault_s=60.0)
+    diagnosis = Diagnosis()
+    diagnosis.note(Reason.MISFIT, False)
+    diagnosis.note(Reason.RISES, size=0.1, fault_s=60.0)
     rises = "The voltage rises by 0.10 V at 60 s, where the current stays as it was."
-    assert diagnosis.verdict(values, one_sd) == (False, False, rises)
+    assert verdict(diagnosis, 0.04, 0.7) == (False, False, rises)
 
 
 def test_what_speaks_against_both_numbers_comes_before_what_speaks_against_one():
-    *rows, settled = Condition
-    assert settled == Condition.SETTLED == len(rows) + 1
+    *rows, settled = Reason
+    assert settled == Reason.SETTLED == len(rows) + 1
     assert sorted(rows, key=lambda row: len(row.against), reverse=True) == rows
 
 

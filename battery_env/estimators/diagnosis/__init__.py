@@ -1,3 +1,1 @@
-"""What speaks against an estimate: a table of conditions, and the evidence of samples, gaps and the rest before a load."""
-
-from battery_env.estimators.diagnosis.conditions import Condition as Condition
+"""The evidence of a record: what its samples, the gaps between them and the rest before the load say."""

@@ -21,6 +21,7 @@ from battery_env.electrochemistry import (
     rest_shares,
 )
 from battery_env.electrochemistry.kernels import MOLE_FRACTION_MARGIN, cell_voltage
+from battery_env.electrochemistry.model_error import MORE_ERRORS, independent_errors
 from battery_env.electrochemistry.tangents import (
     BY_Q,
     BY_R,
@@ -30,25 +31,11 @@ from battery_env.electrochemistry.tangents import (
     voltage_curvature,
     voltage_tangents,
 )
-from battery_env.estimators.diagnosis.conditions import (
-    MISMATCH_MARGIN,
-    MOST_NOISE_SD,
-    MOST_OF_SD,
-    PLAUSIBLE_Q_SHARES,
-    PRIOR_LIMIT_SD,
-    SETTLED_SHARES,
-    Condition,
-)
-from battery_env.estimators.diagnosis.samples import (
-    Row,
-    doubt_condition,
-    fault_condition,
-    is_smeared,
-    start_condition,
-    unseen_C,
-)
-from battery_env.estimators.kalman.state import FILTER, OFFSET, Q, R, Settings
-from battery_env.parameters import PARAMETER_NAMES
+from battery_env.estimators.diagnosis.evidence import unseen_C
+from battery_env.estimators.diagnosis.faults import KEPT, Row
+from battery_env.estimators.kalman.state import FILTER, OFFSET, FilterSettings, Q, R
+from battery_env.estimators.reasons import Reason
+from battery_env.estimators.verdict import MISMATCH_MARGIN, MOST_NOISE_SD, PRIOR_LIMIT_SD, is_plausible, judge, note
 
 #: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
 #: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow
@@ -70,11 +57,7 @@ _LEAST_LOG_WEIGHT = -15.0
 _SAME_SHARE = 0.25
 # The data must have narrowed a prior by this share of its width before a deviation from it says anything.
 _LEAST_NARROWING = 0.2
-_SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"])
-# By number of a condition, which of both it speaks against.
-_AGAINST = np.array([[False, False], *([name in row.against for name in PARAMETER_NAMES] for row in Condition)])
-# The noise that innovations show is averaged over about this many samples.
-_NOISE_MEMORY = 32.0
+_MORE_ERRORS = MORE_ERRORS["record"]
 
 
 def filters_of_prior(
@@ -120,7 +103,7 @@ def _move(one: Row, q_change: float, r_change: float) -> None:
 
 
 @inlined
-def _keep_alive(one: Row, settings: Settings, constants: FloatArray) -> bool:
+def _keep_alive(one: Row, settings: FilterSettings, constants: FloatArray) -> bool:
     # Raises q_mobile to what the charge drawn so far takes; tells whether the model cell has a voltage then.
     q, least = one.mean[Q], 0.0
     for surface in (QNS, QPS):
@@ -134,7 +117,7 @@ def _keep_alive(one: Row, settings: Settings, constants: FloatArray) -> bool:
 
 
 @inlined
-def _predict(one: Row, current: float, duration: float, settings: Settings, constants: FloatArray) -> None:
+def _predict(one: Row, current: float, duration: float, settings: FilterSettings, constants: FloatArray) -> None:
     q, r_o, p = one.mean[Q], one.mean[R], one.covariance
     steps = int(np.ceil(duration / settings.dt_s - 1e-6))
     for _ in range(steps):
@@ -145,55 +128,63 @@ def _predict(one: Row, current: float, duration: float, settings: Settings, cons
 
 
 @inlined
-def _mismatch_V2(seen: Row, settings: Settings) -> float:
+def _mismatch_V2(evidence: Row, settings: FilterSettings) -> float:
     # The model is no better than the voltage at rest shows, beyond noise.
-    start_V2 = (seen.start.first_V - seen.start_V) ** 2 - MOST_NOISE_SD**2 * settings.noise_V2
+    start_V2 = (evidence.start.first_V - evidence.start_V) ** 2 - MOST_NOISE_SD**2 * settings.noise_V2
     return start_V2 if start_V2 > settings.mismatch_V2 else settings.mismatch_V2
 
 
 @inlined
-def _common_error_sd(one: Row, settings: Settings, mismatch_V2: float) -> float:
+def _charge_per_error_C(one: Row) -> float:
+    # For how much charge an error of the model lasts
+    charge_C = one.information.charge_C
+    return charge_C / independent_errors(charge_C, _MORE_ERRORS / one.mean[Q])
+
+
+@inlined
+def _common_error_sd(one: Row, settings: FilterSettings, mismatch_V2: float) -> float:
     # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
     # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
     # seen, almost all of that lies on the few samples there, but an error beyond the margin would show: it is no larger.
-    told, (q_prior, r_prior) = one.told, settings.variance
-    if mismatch_V2 == 0.0 or q_prior == 0.0 or told.charge_C == 0.0:
+    information, (q_prior, r_prior) = one.information, settings.variance
+    if mismatch_V2 == 0.0 or q_prior == 0.0 or information.charge_C == 0.0:
         return 0.0
-    beside_r = told.qq
+    charge_C, own_qq = _charge_per_error_C(one), information.qq
     if r_prior > 0.0:
-        beside_r -= told.qr * told.qr / (told.rr + mismatch_V2 * told.charge_C / r_prior)
-    if not beside_r > 0.0:
+        own_qq -= information.qr * information.qr / (information.rr + mismatch_V2 * charge_C / r_prior)
+    if not own_qq > 0.0:
         return inf
-    spread = min(1.0, MISMATCH_MARGIN * told.q / sqrt(told.charge_C * told.qq))
-    return spread * sqrt(mismatch_V2 * told.charge_C / beside_r)
+    spread = min(1.0, MISMATCH_MARGIN * information.q / sqrt(information.charge_C * information.qq))
+    return spread * sqrt(mismatch_V2 * charge_C / own_qq)
 
 
 @inlined
 def _resistive_error_sd(one: Row, mismatch_V2: float) -> float:
     # And of r_o: an error that goes with the current is no offset, which a load that varies would tell from it.
-    told = one.told
-    return sqrt(mismatch_V2 * told.charge_C / told.rr) if told.rr > 0.0 else 0.0
+    information = one.information
+    return sqrt(mismatch_V2 * _charge_per_error_C(one) / information.rr) if information.rr > 0.0 else 0.0
 
 
 @inlined
 def _r_by_share(one: Row) -> float:
     # What r_o makes up for a share of q_mobile that was drawn at first and not counted, beside what q_mobile makes up for.
-    told = one.told
-    both = told.rr * told.qq - told.qr * told.qr
-    return one.mean[Q] ** 2 * abs(told.by_r * told.qq - told.by_q * told.qr) / both if both > 0.0 else 0.0
+    information = one.information
+    both = information.rr * information.qq - information.qr * information.qr
+    by_start = abs(information.by_r * information.qq - information.by_q * information.qr)
+    return one.mean[Q] ** 2 * by_start / both if both > 0.0 else 0.0
 
 
 @inlined
-def _add_to(told: Row, charge: float, by_q: float, by_r: float) -> None:
+def _add_to(information: Row, charge: float, by_q: float, by_r: float) -> None:
     # What a sample tells, by the charge that flowed before it
-    told.q += charge * abs(by_q)
-    told.qq += charge * by_q * by_q
-    told.qr += charge * by_q * by_r
-    told.rr += charge * by_r * by_r
-    told.charge_C += charge
+    information.q += charge * abs(by_q)
+    information.qq += charge * by_q * by_q
+    information.qr += charge * by_q * by_r
+    information.rr += charge * by_r * by_r
+    information.charge_C += charge
     if charge > 0.0:
-        told.by_q += charge * by_q * by_q / told.charge_C
-        told.by_r += charge * by_q * by_r / told.charge_C
+        information.by_q += charge * by_q * by_q / information.charge_C
+        information.by_r += charge * by_q * by_r / information.charge_C
 
 
 @inlined
@@ -202,7 +193,7 @@ def _correct(
     voltage: float,
     charge: float,
     noise: float,
-    settings: Settings,
+    settings: FilterSettings,
     packed: PackedConstants,
     derivatives: PolynomialDerivatives,
 ) -> None:
@@ -226,7 +217,7 @@ def _correct(
     # innovations may show more than the stated mismatch before they contradict it
     spare_V2 = (MISMATCH_MARGIN**2 - 1.0) * settings.mismatch_V2
     one.innovation = min(max(innovation / sqrt(variance + spare_V2), -GATE_SD), GATE_SD)
-    one.shown_V2 = min(innovation * innovation, (GATE_SD * sd) ** 2) - explained
+    one.noise_V2 = min(innovation * innovation, (GATE_SD * sd) ** 2) - explained
     beyond = max(abs(innovation) / sd / GATE_SD, 1.0)
     # Huber's loss: quadratic up to the gate, linear beyond, where a larger variance stands for it
     loss = innovation * innovation / variance if beyond == 1.0 else GATE_SD**2 * (2.0 * beyond - 1.0)
@@ -238,20 +229,20 @@ def _correct(
             # Joseph's form, multiplied out
             p[j, k] += gain[j] * gain[k] * variance - gain[j] * ph[k] - ph[j] * gain[k]
             p[k, j] = p[j, k]
-    told = one.told
-    _add_to(told, charge, by_q, by_r)
+    information = one.information
+    _add_to(information, charge, by_q, by_r)
     (least_q_C, most_q_C), (least_r, most_r) = settings.bounds
     to_q = min(max(q + gain[Q] * innovation, least_q_C), most_q_C)
     to_r = min(max(r_o + gain[R] * innovation, least_r), most_r)
     mean[OFFSET] += gain[OFFSET] * innovation
     # along the curve of the voltage over the state of charge: with a smaller q_mobile the record comes further
-    if told.qq > 0.0:
-        scale = exp(-0.5 * (1.0 + told.charge_C * by_q * by_q / told.qq) * (to_q / q - 1.0))
-        told.q *= scale
-        told.qq *= scale * scale
-        told.qr *= scale
-        told.by_q *= scale * scale
-        told.by_r *= scale
+    if information.qq > 0.0:
+        scale = exp(-0.5 * (1.0 + information.charge_C * by_q * by_q / information.qq) * (to_q / q - 1.0))
+        information.q *= scale
+        information.qq *= scale * scale
+        information.qr *= scale
+        information.by_q *= scale * scale
+        information.by_r *= scale
     _move(one, to_q - q, to_r - r_o)
 
 
@@ -300,12 +291,12 @@ def _mix(bank: Row, filters: Row, best: int, voltage: float) -> None:
             r += weight * dr
             qq += weight * (one.covariance[Q, Q] + dq * dq)
             rr += weight * (one.covariance[R, R] + dr * dr)
-            square += weight * one.shown_V2
+            square += weight * one.noise_V2
             normalized += weight * one.innovation
     q, r = q / total, r / total
     normalized /= total
     if not isnan(voltage):
-        bank.noise_V2 = max(bank.noise_V2 + (square / total - bank.noise_V2) / _NOISE_MEMORY, 0.0)
+        bank.noise_V2 = max(bank.noise_V2 + (square / total - bank.noise_V2) / KEPT, 0.0)
         bank.products = _PRODUCTS_MEMORY * bank.products + normalized * bank.last
         bank.variance = _PRODUCTS_MEMORY**2 * bank.variance + 1.0
         bank.trend_sd = max(bank.trend_sd, bank.products / sqrt(bank.variance))
@@ -332,13 +323,13 @@ def take(
     filters: Row,
     sample: Row,
     voltage: float,
-    settings: Settings,
+    settings: FilterSettings,
     packed: PackedConstants,
     derivatives: PolynomialDerivatives,
 ) -> None:
     """Take in one sample of a cell, of which this voltage counts; unchecked."""
     bank, duration, temperature = cell.bank, sample.dt_s, sample.temperature_K
-    constants, current = packed.constants, cell.seen.current_A
+    constants, current = packed.constants, cell.evidence.current_A
     noise, charge = max(bank.noise_V2, settings.noise_V2), abs(current) * duration
     before = _heaviest(filters)
     for m in range(len(filters)):
@@ -360,65 +351,37 @@ def take(
     bank.offset_V2 += settings.offset_growth * duration
     _doubt(bank, filters[best].mean[OFFSET])
     bank.expected_V = filters[before].expected_V  # by the filter that did not know yet
-    mismatch_V2 = _mismatch_V2(cell.seen, settings)
+    mismatch_V2 = _mismatch_V2(cell.evidence, settings)
     bank.common_sd[Q] = _common_error_sd(filters[best], settings, mismatch_V2)
     bank.common_sd[R] = _resistive_error_sd(filters[best], mismatch_V2)
     bank.r_by_share = _r_by_share(filters[best])
 
 
 @compiled
-def _note(estimate: Row, condition: int, holds: bool) -> None:
-    # of each number that it speaks against, the row of the table that comes first counts
-    row = condition + 0  # a member of an enumeration is no index in older versions of numba
-    for k in range(2):
-        if holds and _AGAINST[row, k] and row < estimate.condition[k]:
-            estimate.condition[k] = row
-
-
-@compiled
-def conclude(cell: Row, settings: Settings, estimate: Row) -> None:
+def conclude(cell: Row, settings: FilterSettings, estimate: Row) -> None:
     """Say what a bank estimates after a sample that was examined, and what speaks against it; unchecked."""
-    bank, seen, searched = cell.bank, cell.seen, settings.searched
-    # what shows nowhere in the voltage, and what nobody saw, as if it had been missing at the start
-    gain_sd, unseen_share = settings.gain_sd, hypot(settings.sd_soc, unseen_C(seen) / bank.mean[Q])
-    estimate.q_mobile, estimate.r_o = bank.mean[Q], bank.mean[R]
-    estimate.condition[:] = Condition.SETTLED + 0
-    start, fault = start_condition(seen), fault_condition(seen)
-    _note(estimate, start, start > 0)
-    _note(estimate, fault, fault > 0)
-    _note(estimate, Condition.EMPTY, not bank.has_voltage)
-    least, most = PLAUSIBLE_Q_SHARES
-    plausible = least * settings.cell_q_mobile < bank.mean[Q] < most * settings.cell_q_mobile
-    _note(estimate, Condition.IMPLAUSIBLE, searched[Q] and not plausible)
-    _note(estimate, Condition.MISFIT, bank.trend_sd > LIMIT_SD)
-    estimate.r_o_comes_first, beyond_q = False, 0.0
+    bank, evidence, known = cell.bank, cell.evidence, settings.known
+    estimate.reason[:] = Reason.SETTLED + 0
+    note(estimate, Reason.EMPTY, not bank.has_voltage)
+    note(estimate, Reason.IMPLAUSIBLE, settings.searched[Q] and not is_plausible(bank.mean[Q], settings.cell_q_mobile))
+    note(estimate, Reason.MISFIT, bank.trend_sd > LIMIT_SD)
+    # what nobody saw, as if it had been missing at the start
+    unseen_share = hypot(known.sd_soc, unseen_C(evidence) / bank.mean[Q])
     for k in range(2):
-        if not searched[k]:
-            estimate.sd[k] = nan
+        value, own_sd, (low, high), (mean, prior_sd) = bank.mean[k], bank.sd[k], settings.bounds[k], settings.carried[k]
+        estimate.value[k], estimate.sd[k], estimate.is_searched[k] = value, nan, settings.searched[k]
+        if not settings.searched[k]:
             continue
-        value, (low, high), (mean, prior_sd) = bank.mean[k], settings.bounds[k], settings.carried[k]
         common_sd = (bank.common_sd[k] ** -2.0 + 1.0 / settings.variance[k]) ** -0.5
         hidden_sd = bank.mean[Q] * unseen_share
         if k == R:
-            hidden_sd = hypot(bank.r_by_share * unseen_share, hypot(seen.dropped_ohm, settings.cell_sd_r_o))
-        sd = hypot(hypot(max(bank.sd[k], common_sd), gain_sd * value), hidden_sd)
-        estimate.sd[k], of_data = sd, sd
-        _note(estimate, Condition.Q_AT_BOUND + k, not low + bank.sd[k] < value < high - bank.sd[k])
+            hidden_sd = hypot(bank.r_by_share * unseen_share, hypot(evidence.dropped_ohm, known.cell_sd_r_o))
+        sd = hypot(hypot(max(own_sd, common_sd), known.gain_sd * value), hidden_sd)
+        estimate.sd[k], estimate.own_sd[k], estimate.has_prior[k] = sd, sd, prior_sd > 0.0
+        note(estimate, Reason.Q_AT_BOUND + k, not low + own_sd < value < high - own_sd)
         if prior_sd > 0.0:
-            narrowed = max(prior_sd**2 - bank.sd[k] ** 2, (_LEAST_NARROWING * prior_sd) ** 2)
-            _note(estimate, Condition.Q_PRIOR_WRONG + k, (value - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed)
+            narrowed = max(prior_sd**2 - own_sd**2, (_LEAST_NARROWING * prior_sd) ** 2)
+            note(estimate, Reason.Q_PRIOR_WRONG + k, (value - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed)
             # precisions add up
-            of_data = max(max(bank.sd[k] ** -2.0 - prior_sd**-2.0, 0.0) ** -0.5, bank.common_sd[k])
-            _note(estimate, Condition.Q_PRIOR_ALONE + k, of_data >= _SHARES[k] * value)
-        _note(estimate, Condition.R_SWITCHES, k == R and is_smeared(seen))
-        if not sd < _SHARES[k] * value:
-            _note(estimate, Condition.R_DROPPED, k == R and seen.dropped_ohm > MOST_OF_SD * sd)
-            _note(estimate, Condition.R_OF_CONSTANTS, k == R and settings.cell_sd_r_o > MOST_OF_SD * sd)
-            doubt = doubt_condition(seen, sd)
-            _note(estimate, doubt, k == Q and doubt > 0)
-            _note(estimate, Condition.Q_SCALE_UNKNOWN + k, hypot(gain_sd, settings.sd_soc * (k == Q)) >= _SHARES[k])
-            _note(estimate, Condition.Q_IMPRECISE + k, True)
-        # in standard deviations that a settled one may have
-        beyond = max(sd, of_data) / (_SHARES[k] * value)
-        estimate.r_o_comes_first = k == R and beyond > beyond_q
-        beyond_q = beyond
+            estimate.own_sd[k] = max(max(own_sd**-2.0 - prior_sd**-2.0, 0.0) ** -0.5, bank.common_sd[k])
+    judge(estimate, evidence, known)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from math import inf, isnan, nan
 from typing import Any
@@ -17,12 +17,13 @@ from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.electrochemistry.tangents import PolynomialDerivatives
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis import gaps
-from battery_env.estimators.diagnosis.conditions import Condition, Verdict
-from battery_env.estimators.diagnosis.rest import check_initial_soc
-from battery_env.estimators.diagnosis.samples import begin, belongs, examine, expect, measured, remember, take_in
+from battery_env.estimators.diagnosis.evidence import begin, belongs, examine, expect, measured, remember, take_in
+from battery_env.estimators.diagnosis.rest import LEAST_ERROR_V, check_initial_soc
 from battery_env.estimators.estimator import ModelNow, OnlineEstimator, check_bounds
 from battery_env.estimators.kalman.bank import conclude, filters_of_prior, take
-from battery_env.estimators.kalman.state import CELL, ESTIMATE, FILTER, SAMPLE, Q, R, Settings
+from battery_env.estimators.kalman.state import CELL, FILTER, SAMPLE, FilterSettings, Q, R
+from battery_env.estimators.reasons import Reason
+from battery_env.estimators.verdict import JUDGED, Assumptions, Verdict
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import ChargeBefore, Record, Stream, check_drawn_charge, check_sample, history_of
 
@@ -33,7 +34,6 @@ _PRIOR_SD_R_OHM = 0.15
 _HOUR_S = 3600.0
 # So far may the parameters wander in an hour, as a share of their prior means: a little keeps a filter awake.
 _DRIFT_PER_HOUR = 0.001
-_NOISE_V = 0.005
 
 
 class ExtendedKalmanFilter(OnlineEstimator):
@@ -81,12 +81,12 @@ class ExtendedKalmanFilter(OnlineEstimator):
     then; the first one is also that of its surroundings.
 
     *Settled* means that the data determine every parameter searched for: its standard deviation, without what a given prior
-    adds to it, is below :data:`~battery_env.estimators.diagnosis.conditions.SETTLED_SHARES` of its value; and that nothing
+    adds to it, is below :data:`~battery_env.estimators.reasons.SETTLED_SHARES` of its value; and that nothing
     contradicts it: not the start of the record, the voltage where the load is switched, steady or not logged, a bound, the
     kind of cell, the prior, nor the innovations, which may not go the same way again and again, with twice ``mismatch_V``
     allowed for.
     Otherwise ``reason`` of the estimate says which of these does not hold: of each number the first one in the order of
-    :class:`~battery_env.estimators.diagnosis.Condition`, and first that of the number that is farther beyond its limit. Of
+    :class:`~battery_env.estimators.diagnosis.Reason`, and first that of the number that is farther beyond its limit. Of
     a number that the data determine, while they do not determine the other one, ``settled_q_mobile`` or ``settled_r_o`` says
     so. An estimate that rests on a prior is not settled: it is as good as
     the prior.
@@ -139,7 +139,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self.thermal = thermal
         self.dt_s = check_dt(dt_s, self.cell)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
-        offset_sd_V = max(_NOISE_V, mismatch_V) if offset_sd_V is None else offset_sd_V
+        offset_sd_V = max(LEAST_ERROR_V, mismatch_V) if offset_sd_V is None else offset_sd_V
         check_not_negative(offset_sd_V=offset_sd_V, mismatch_V=mismatch_V, cell_sd_r_o_ohm=cell_sd_r_o_ohm)
         voltage_noise_V = _checked_noise_V(voltage_noise_V, mismatch_V)
         self.current_gain_sd = check_gain_sd(current_gain_sd)
@@ -148,7 +148,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM * NEW_CELL.q_mobile / self.cell.q_mobile)
         self._means, self._sds = (q, r_o), (q_sd, r_o_sd, float(offset_sd_V))
         soc, sd_soc = self.initial_soc
-        self._settings = Settings(
+        self._settings = FilterSettings(
             dt_s=self.dt_s,
             thermal=thermal,
             noise_V2=float(voltage_noise_V) ** 2,
@@ -162,10 +162,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
             offset_growth=float(mismatch_V) ** 2 / _HOUR_S,
             bounds=(_pair(q_mobile_bounds_C), _pair(r_o_bounds_ohm)),
             carried=(_pair(prior_q_mobile_C or (0.0, 0.0)), _pair(prior_r_o_ohm or (0.0, 0.0))),
-            gain_sd=float(self.current_gain_sd),
-            sd_soc=float(sd_soc / soc),
             cell_q_mobile=float(self.cell.q_mobile),
-            cell_sd_r_o=float(cell_sd_r_o_ohm),
+            known=Assumptions(float(self.current_gain_sd), float(sd_soc / soc), float(cell_sd_r_o_ohm)),
         )
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
         self._cell = np.zeros((), CELL)
@@ -199,7 +197,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         self._cell["ambient_K"] = ambient_K
         cell = self._cell_now()
         self._cell["constants"] = cell.packed.constants
-        expect(self._cell["seen"], cell, self.initial_soc[0])
+        expect(self._cell["evidence"], cell, self.initial_soc[0])
         self._filters[...] = self._start(cell)
 
     def _cell_now(self) -> CellParameters:
@@ -208,7 +206,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
-        seen = self._cell["seen"]
+        seen = self._cell["evidence"]
         before_A = float(seen["current_A"]) if seen["samples"] else None
         check_sample(voltage_V, current_A, dt_s, temperature_C, before_A)
         check_drawn_charge(float(seen["drawn_C"]) + (0.0 if before_A is None else dt_s * before_A), self.least_drawn_C)
@@ -220,25 +218,26 @@ class ExtendedKalmanFilter(OnlineEstimator):
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
         temperature_K = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
-        if not self._cell["seen"]["samples"]:
+        if not self._cell["evidence"]["samples"]:
             dt_s = 0.0
             if not isnan(temperature_K):
                 self._begin(temperature_K)
         sample = np.array([(voltage_V, current_A, dt_s, temperature_K, current_A)], dtype=SAMPLE)
-        (said,) = self._follow(sample)
-        shown = self._measured(self._cell["seen"])
-        verdict = _verdict(said["condition"].tolist(), said["r_o_comes_first"], shown)
-        return Estimate(float(said["q_mobile"]), float(said["r_o"]), *said["sd"].tolist(), **verdict._asdict())
+        (judged,) = self._follow(sample)
+        verdict = Verdict.of(judged["reason"].tolist(), judged["r_o_comes_first"], self._measured())
+        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = judged["value"].tolist(), judged["sd"].tolist()
+        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **verdict._asdict())
 
     def _follow(self, samples: NDArray[np.void]) -> NDArray[np.void]:
         """What is estimated after each of these samples."""
-        estimates = np.empty(len(samples), ESTIMATE)
+        estimates = np.zeros(len(samples), JUDGED)
         _follow_all(self._cell, self._filters, samples, self._settings, self.cell.packed, self._derivatives, estimates)
         return estimates
 
-    def _measured(self, seen: Any, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
+    def _measured(self, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
         """What texts say, by the names in their braces."""
-        return measured(seen, self.initial_soc[0], clock_s, charge) | {"of_cell_mohm": 1e3 * self._settings.cell_sd_r_o}
+        of_cell = {"of_cell_mohm": 1e3 * self._settings.known.cell_sd_r_o}
+        return measured(self._cell["evidence"], self.initial_soc[0], clock_s, charge) | of_cell
 
     def follow(self, record: Record) -> EstimateTrace:
         """
@@ -257,17 +256,16 @@ class ExtendedKalmanFilter(OnlineEstimator):
         history = history_of(record)
         if self.initial_soc[0] < 1.0:
             history = history._replace(charge=None)
-        take_in(self._cell["seen"], history)
+        take_in(self._cell["evidence"], history)
         check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
-        said = self._follow(samples)
-        shown = self._measured(self._cell["seen"], float(time_s[0]), history.charge)
-        noted = list(zip(map(tuple, said["condition"].tolist()), said["r_o_comes_first"].tolist(), strict=True))
-        texts = {each: _verdict(*each, shown).reason for each in set(noted)}
-        sd_q, sd_r_o = said["sd"].T.copy()
-        settled_q, settled_r_o = (said["condition"] == Condition.SETTLED).T
-        reasons = np.array([texts[each] for each in noted], dtype=object)
-        columns = (said["q_mobile"].copy(), said["r_o"].copy(), sd_q, sd_r_o)
-        return EstimateTrace(time_s, *columns, settled_q & settled_r_o, reasons, settled_q, settled_r_o)
+        judged, said = self._follow(samples), self._measured(float(time_s[0]), history.charge)
+        first = list(zip(map(tuple, judged["reason"].tolist()), judged["r_o_comes_first"].tolist(), strict=True))
+        texts = {each: Verdict.of(each[0], each[1], said).reason for each in set(first)}
+        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = judged["value"].T.copy(), judged["sd"].T.copy()
+        settled_q, settled_r_o = (judged["reason"] == Reason.SETTLED).T
+        reasons = np.array([texts[each] for each in first], dtype=object)
+        settled = settled_q & settled_r_o
+        return EstimateTrace(time_s, q_mobile, r_o, sd_q_mobile, sd_r_o, settled, reasons, settled_q, settled_r_o)
 
     @property
     def least_drawn_C(self) -> float:
@@ -313,14 +311,10 @@ class ExtendedKalmanFilter(OnlineEstimator):
         return {"cell": self._cell, "filters": self._filters}
 
 
-def _verdict(first: Sequence[int], r_o_comes_first: bool, shown: Mapping[str, Any]) -> Verdict:
-    return Verdict.of(first, r_o_comes_first, lambda row: row.said(shown))
-
-
 def _checked_noise_V(voltage_noise_V: float | None, mismatch_V: float) -> float:
     """The noise of a voltage sample that is stated, or what follows from the error of the model."""
     if voltage_noise_V is None:
-        return float(max(_NOISE_V, mismatch_V))
+        return float(max(LEAST_ERROR_V, mismatch_V))
     if not 0.0 < voltage_noise_V < inf:
         raise ValueError(f"voltage_noise_V must be greater than 0 V, got {voltage_noise_V!r}. Exact records: 1e-4.")
     if voltage_noise_V < mismatch_V:
@@ -340,24 +334,24 @@ def _follow_all(
     one: NDArray[np.void],
     filters: NDArray[np.void],
     samples: NDArray[np.void],
-    settings: Settings,
+    settings: FilterSettings,
     packed: PackedConstants,
     derivatives: PolynomialDerivatives,
     estimates: NDArray[np.void],
 ) -> None:
     # every sample of a cell, an array of no dimension, into the estimate after it
     cell: Any = one[()]
-    bank, seen = cell.bank, cell.seen
+    bank, evidence = cell.bank, cell.evidence
     of_cell = PackedConstants(cell.constants, packed.polynomial_n, packed.polynomial_p)
     for k in range(len(samples)):
         sample = samples[k]
         voltage, current, duration = sample.voltage_V, sample.current_A, sample.dt_s
-        begin(seen, duration)
-        examine(seen, voltage, current, bank.mean[Q], bank.mean[R], settings.cell_q_mobile)
+        begin(evidence, duration)
+        examine(evidence, voltage, current, bank.mean[Q], bank.mean[R], settings.cell_q_mobile)
         # a voltage that does not follow its current corrects nothing
-        belonging_V = voltage if belongs(seen) else nan
+        belonging_V = voltage if belongs(evidence) else nan
         take(cell, filters, sample, belonging_V, settings, of_cell, derivatives)
-        if seen.samples > 1 and duration > 0.0:
-            gaps.follow(seen, belonging_V, current, bank.expected_V, bank.mean[Q])
+        if evidence.samples > 1 and duration > 0.0:
+            gaps.follow(evidence, belonging_V, current, bank.expected_V, bank.mean[Q])
         conclude(cell, settings, estimates[k])
-        remember(seen, voltage, current, sample.read_A)
+        remember(evidence, voltage, current, sample.read_A)

@@ -8,13 +8,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
-from battery_env.estimators.diagnosis.samples import SEEN, table
+from battery_env.estimators.diagnosis.evidence import EVIDENCE
+from battery_env.estimators.diagnosis.faults import table
+from battery_env.estimators.verdict import Assumptions
 
 #: What a filter estimates: ``q_mobile`` (C), ``r_o`` (ohm) and the offset of the voltage (V).
 Q, R, OFFSET = range(3)
 
 
-class Settings(NamedTuple):
+class FilterSettings(NamedTuple):
     """What a filter is told, with pairs for ``q_mobile`` and ``r_o``."""
 
     dt_s: float  # longest time step of the model, s
@@ -27,18 +29,12 @@ class Settings(NamedTuple):
     offset_growth: float  # of the variance of the offset, V^2/s
     bounds: tuple[tuple[float, float], tuple[float, float]]  # where each stays, C and ohm
     carried: tuple[tuple[float, float], tuple[float, float]]  # mean and sd of each from an earlier discharge; 0: none
-    gain_sd: float  # of the current sensor, which scales both and does not show in the voltage
-    sd_soc: float  # that of the charge at the start, as a share of it
     cell_q_mobile: float  # of the model's cell, C
-    cell_sd_r_o: float  # what the constants of that cell leave open of ``r_o``, ohm
+    known: Assumptions  # what is taken for known, and does not show in the voltage
 
 
 #: One sample; its current is the mean until the next one, and was read at its time.
 SAMPLE = table("voltage_V current_A dt_s temperature_K read_A")
-
-#: What is said after a sample, with the :class:`~battery_env.estimators.diagnosis.Condition` that speaks first against each
-#: number, and whether that against ``r_o`` is the larger doubt.
-ESTIMATE = table([("q_mobile", "f8"), ("r_o", "f8"), ("sd", "f8", 2), ("condition", "i8", 2), ("r_o_comes_first", "b1")])
 
 # Sums over the charge drawn, of the derivative of the voltage by q_mobile (V) and of products with that by r_o (V^2/C, V A,
 # A^2 C), and that charge (C); and of products of both with the derivative by q_mobile over the charge, as that by a charge at
@@ -53,10 +49,10 @@ FILTER = table(
         ("mean", "f8", 3),
         ("covariance", "f8", (3, 3)),
         ("log_weight", "f8"),  # -inf: given up
-        ("shown_V2", "f8"),  # variance of the noise that the last innovation showed
+        ("noise_V2", "f8"),  # variance of the noise that the last innovation showed
         ("innovation", "f8"),  # the last one over its standard deviation, within the gate
         ("expected_V", "f8"),  # voltage of the model at the last sample before it was taken in, with the offset
-        ("told", _INFORMATION),
+        ("information", _INFORMATION),
     ]
 )
 
@@ -95,6 +91,6 @@ CELL = table(
         ("ambient_K", "f8"),  # the model's surroundings, and the constants that follow from them
         ("constants", "f8", NEW_CELL.packed.constants.shape),
         ("bank", _BANK),
-        ("seen", SEEN),
+        ("evidence", EVIDENCE),
     ]
 )

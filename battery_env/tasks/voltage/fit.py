@@ -29,6 +29,7 @@ from battery_env.electrochemistry.cell import (
 )
 from battery_env.electrochemistry.equilibrium import on_unit_range, with_equilibrium
 from battery_env.electrochemistry.kernels import BLOCK
+from battery_env.electrochemistry.model_error import independent_errors
 from battery_env.parameters import PARAMETER_NAMES, columns_of
 from battery_env.tasks.voltage.readings import (
     AT_REST,
@@ -525,7 +526,7 @@ def nuisance_step(
         drawn_C = _linearize(n, count[n], estimate, shown, model[0], constants, added, sums)
         before[_Q], before[_R] = estimate[n, 0], estimate[n, 1]
         before[_KN:] = constants[n]
-        errors = 1.0 + known.errors_per_C * max(drawn_C, 0.0)
+        errors = independent_errors(max(drawn_C, 0.0), known.errors_per_C)
         least_noise_V = np.sqrt(_LEAST_NOISE_V**2 + known.mismatch_V**2 * count[n] / errors)
         prior = known.mean[n], known.units[n], known.precision, known.alone
         _solve_under_priors(sums, before, count[n], least_noise_V, *prior, found[n])

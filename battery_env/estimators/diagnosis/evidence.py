@@ -16,20 +16,10 @@ from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
-from battery_env.estimators.diagnosis.conditions import (
-    ABOVE_REST_V,
-    LACKING_SHARE,
-    MOST_OF_SD,
-    SETTLED_SHARES,
-    Condition,
-    Diagnosis,
-    low_rest_voltage_V,
-    rest_voltage_V,
-    start_measured,
-)
-from battery_env.estimators.diagnosis.rest import LEAST_REST_S
-from battery_env.estimators.diagnosis.rows import KEPT, STEADY_S, Row, find, middle, noise_V, table
-from battery_env.records import LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE, ChargeBefore, ChargeHistory, Samples
+from battery_env.estimators.diagnosis.faults import KEPT, Row, find, middle, noise_V, table
+from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, LACKING_SHARE, low_rest_voltage_V, rest_voltage_V
+from battery_env.estimators.reasons import MOST_OF_SD, SETTLED_SHARES, Reason
+from battery_env.records import LOAD_SHARE, REST_CURRENT_A, STEADY_S, SWITCH_SHARE, ChargeBefore, ChargeHistory, Samples
 from battery_env.records.load import SWITCHES, note_switch, switched_C
 
 # A cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s. So does one whose
@@ -92,10 +82,10 @@ _RING = table(
 )
 
 # The first fault that was found, 0 if there is none: when, and how large it is.
-_FAULT = table([("condition", "i8"), *((name, "f8") for name in ("time_s", "since_s", "size"))])
+_FAULT = table([("reason", "i8"), *((name, "f8") for name in ("time_s", "since_s", "size"))])
 
 #: What the samples of a discharge have shown so far.
-SEEN = table(
+EVIDENCE = table(
     [
         ("samples", "i8"),
         ("time_s", "f8"),
@@ -125,7 +115,7 @@ SEEN = table(
 )
 
 
-def watched(
+def evidence_of(
     record: Samples,
     cell: CellParameters,
     initial_soc: float | None,
@@ -134,71 +124,67 @@ def watched(
     model_V: FloatArray | None = None,
 ) -> Any:
     """
-    What the samples of a whole record show beside an estimate of ``q_mobile``, C, and ``r_o``, ohm, a row of ``SEEN``. Without
-    a state of charge no rest is expected at the start; without the voltage of the model gaps are not looked at.
+    What the samples of a whole record show beside an estimate of ``q_mobile``, C, and ``r_o``, ohm: a row of ``EVIDENCE``.
+    Without a state of charge no rest is expected at the start; without the voltage of the model gaps are not looked at.
     """
-    seen = np.zeros(1, SEEN)
-    expect(seen, cell, initial_soc)
-    take_in(seen, history)
-    columns = (np.ascontiguousarray(column) for column in record)
-    _watch_all(seen, *columns, np.empty(0) if model_V is None else model_V, *estimate, cell.q_mobile)
-    return seen[0]
+    evidence, (q_mobile, r_o) = np.zeros(1, EVIDENCE), estimate
+    expect(evidence, cell, initial_soc)
+    take_in(evidence, history)
+    time_s, voltage_V, current_A = (np.ascontiguousarray(column) for column in record)
+    expected_V = np.empty(0) if model_V is None else model_V
+    _watch_all(evidence, time_s, voltage_V, current_A, expected_V, q_mobile, r_o, cell.q_mobile)
+    return evidence[0]
 
 
-def note_samples(
-    diagnosis: Diagnosis, seen: Any, initial_soc: float, record: Samples, history: ChargeHistory, unsettled_sd_C: float = inf
-) -> None:
-    """
-    Note what the start of a record and its sensors, as :func:`watched` saw them, say against an estimate; of a ``q_mobile``
-    that is not settled with its standard deviation, C.
-    """
-    said = measured(seen, initial_soc, float(record.time_s[0]), history.charge)
-    smeared = is_smeared(seen) * Condition.R_SWITCHES
-    for number in (start_condition(seen), fault_condition(seen), doubt_condition(seen, unsettled_sd_C), smeared):
-        if number:
-            diagnosis.note(Condition.numbered(number), **said)
-
-
-def expect(seen: Any, cell: CellParameters, initial_soc: float | None) -> None:
+def expect(evidence: Any, cell: CellParameters, initial_soc: float | None) -> None:
     """Expect a cell at rest with some charge, before the first sample; ``None``: none."""
-    seen["start_V"] = seen["low_V"] = nan
+    evidence["start_V"] = evidence["low_V"] = nan
     if initial_soc is not None:
-        seen["start_V"], seen["low_V"] = rest_voltage_V(cell, initial_soc), low_rest_voltage_V(cell, initial_soc)
+        evidence["start_V"], evidence["low_V"] = rest_voltage_V(cell, initial_soc), low_rest_voltage_V(cell, initial_soc)
 
 
-def take_in(seen: Any, history: ChargeHistory) -> None:
+def take_in(evidence: Any, history: ChargeHistory) -> None:
     """Take in what is known beside the samples, before the first of them."""
-    start, rest, charge, full_V = seen["start"], seen["rest"], history.charge, seen["start_V"]
-    start["at_rest"], seen["is_counted"], seen["uncounted_C"] = history.at_rest, history.is_counted, history.uncounted_C
+    start, rest, charge, full_V = evidence["start"], evidence["rest"], history.charge, evidence["start_V"]
+    start["at_rest"], evidence["is_counted"], evidence["uncounted_C"] = (
+        history.at_rest,
+        history.is_counted,
+        history.uncounted_C,
+    )
     if charge is not None:
         # without a rest a charge that did not taper off tells nothing but that the cell is lower
-        is_low = (charge.highest_V < seen["low_V"]) | (not charge.tapered and history.rest_s < LEAST_REST_S)
+        is_low = (charge.highest_V < evidence["low_V"]) | (not charge.tapered and history.rest_s < STEADY_S)
         start["charge"] = np.where(np.isnan(full_V), 0, np.where(is_low, -1, int(charge.tapered)))
-        seen["left_C"], start["is_cut_short"] = np.where(np.isnan(full_V), 0.0, charge.left_C), not charge.tapered
+        evidence["left_C"], start["is_cut_short"] = np.where(np.isnan(full_V), 0.0, charge.left_C), not charge.tapered
     if history.load_on_C or history.offset_A:
         rest["is_over"], rest["mean_A"], rest["load_on_C"] = True, history.offset_A, history.load_on_C
 
 
-def measured(seen: Any, initial_soc: float, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
+def measured(evidence: Any, initial_soc: float, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
     """What texts say of samples, by the names in their braces, on a clock of its own."""
-    charge, rest = charge or ChargeBefore(nan, nan, nan, nan), seen["rest"]
-    fault, switch, gap = seen["fault"], seen["switch"], seen["gap"]
-    end_s = clock_s + gap["end_s"]
-    return start_measured(float(seen["start"]["first_V"]), float(seen["start_V"]), initial_soc) | {
+    charge, rest = charge or ChargeBefore(nan, nan, nan, nan), evidence["rest"]
+    fault, switch, gap = evidence["fault"], evidence["switch"], evidence["gap"]
+    end_s, is_full = clock_s + gap["end_s"], initial_soc == 1.0
+    whole = "Give the whole discharge of a full cell, with the rest before it, or state initial_soc (--initial-soc)."
+    return {
+        "first_V": float(evidence["start"]["first_V"]),
+        "rest_V": float(evidence["start_V"]),
+        "expected": "a full cell" if is_full else f"a cell with {initial_soc:.0%} of its charge",
+        "start_advice": whole if is_full else "State another initial_soc (--initial-soc).",
         "charge_V": charge.highest_V,
         "charge_A": charge.last_A,
         "load_on_C": rest["load_on_C"],
         "offset_A": rest["mean_A"],
-        "offset_C": abs(rest["mean_A"]) * (seen["time_s"] - rest["over_s"]),
-        "fault_s": clock_s + (fault["time_s"] if fault["condition"] else switch["time_s"]),
+        "offset_C": abs(rest["mean_A"]) * (evidence["time_s"] - rest["over_s"]),
+        "fault_s": clock_s + (fault["time_s"] if fault["reason"] else switch["time_s"]),
         "since_s": clock_s + fault["since_s"],
-        "size": fault["size"] if fault["condition"] else switch["size_A"],
-        "switched_C": float(switched_C(seen["switches"])),
-        "switches": seen["switches"]["count"],
-        "uncounted_C": seen["uncounted_C"],
-        "left_C": seen["left_C"],
-        "dropped_C": seen["dropped_C"],
-        "dropped_mohm": 1e3 * seen["dropped_ohm"],
+        "size": fault["size"] if fault["reason"] else switch["size_A"],
+        "switched_C": float(switched_C(evidence["switches"])),
+        "switches": evidence["switches"]["count"],
+        "uncounted_C": evidence["uncounted_C"],
+        "left_C": evidence["left_C"],
+        "dropped_C": evidence["dropped_C"],
+        "dropped_mohm": 1e3 * evidence["dropped_ohm"],
         "gap_start_s": end_s - gap["length_s"],
         "gap_end_s": end_s,
         "gap_C": gap["charge_C"],
@@ -216,52 +202,52 @@ def _watch_all(
     r_o: float,
     cell_q_mobile: float,
 ) -> None:
-    seen = rows[0]
+    evidence = rows[0]
     for n in range(len(time_s)):
-        begin(seen, time_s[n] - time_s[max(n - 1, 0)])
-        examine(seen, voltage_V[n], current_A[n], q_mobile, r_o, cell_q_mobile)
+        begin(evidence, time_s[n] - time_s[max(n - 1, 0)])
+        examine(evidence, voltage_V[n], current_A[n], q_mobile, r_o, cell_q_mobile)
         if n > 0 and len(model_V) > 0:
-            gaps.follow(seen, voltage_V[n], current_A[n], model_V[n], q_mobile)
-        remember(seen, voltage_V[n], current_A[n], current_A[n])
+            gaps.follow(evidence, voltage_V[n], current_A[n], model_V[n], q_mobile)
+        remember(evidence, voltage_V[n], current_A[n], current_A[n])
 
 
 @compiled
-def begin(seen: Row, duration: float) -> None:
+def begin(evidence: Row, duration: float) -> None:
     """Count the time since the sample before, and the charge drawn in it."""
-    seen.samples += 1
-    seen.interval_s = duration
-    seen.time_s += duration
-    seen.drawn_C += seen.current_A * duration
+    evidence.samples += 1
+    evidence.interval_s = duration
+    evidence.time_s += duration
+    evidence.drawn_C += evidence.current_A * duration
 
 
 @compiled
-def examine(seen: Row, voltage: float, current: float, q_mobile: float, r_o: float, cell_q_mobile: float) -> None:
+def examine(evidence: Row, voltage: float, current: float, q_mobile: float, r_o: float, cell_q_mobile: float) -> None:
     """Look whether one more voltage belongs to its current, beside an estimate and the model's cell."""
-    if seen.samples > 1 and not isnan(voltage):
-        before, ring = seen.before, seen.ring
+    if evidence.samples > 1 and not isnan(voltage):
+        before, ring = evidence.before, evidence.ring
         ring.change_V[ring.n_changes % KEPT] = voltage - before.voltage_1_V
         ring.n_changes += 1
         middle_V = middle(before.voltage_2_V, before.voltage_1_V, voltage)
-        resistance_ohm = _least_resistance_ohm(seen.start, q_mobile, r_o)
-        _examine_last(seen, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile), r_o)
-        switch = seen.switch
+        resistance_ohm = _least_resistance_ohm(evidence.start, q_mobile, r_o)
+        _examine_last(evidence, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile), r_o)
+        switch = evidence.switch
         lowest_V, highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
-        is_pending = switch.size_A != 0.0 and seen.fault.condition == 0
-        seen.pending = is_pending and not _is_followed(seen, seen.time_s, lowest_V, highest_V, resistance_ohm)
-    _note_start(seen, voltage, current, cell_q_mobile)
+        is_pending = switch.size_A != 0.0 and evidence.fault.reason == 0
+        evidence.pending = is_pending and not _is_followed(evidence, evidence.time_s, lowest_V, highest_V, resistance_ohm)
+    _note_start(evidence, voltage, current, cell_q_mobile)
 
 
 @compiled
-def remember(seen: Row, voltage: float, current: float, read_A: float) -> None:
+def remember(evidence: Row, voltage: float, current: float, read_A: float) -> None:
     """Keep a sample that was examined: its current until the next, and the one that was read at its time."""
-    before = seen.before
-    _note_rest(seen.rest, seen.time_s, seen.interval_s, current)
+    before = evidence.before
+    _note_rest(evidence.rest, evidence.time_s, evidence.interval_s, current)
     # that of load-on is judged there
-    note_switch(seen.switches, read_A, seen.interval_s if seen.rest.on_s == 0.0 else 0.0)
+    note_switch(evidence.switches, read_A, evidence.interval_s if evidence.rest.on_s == 0.0 else 0.0)
     if not isnan(voltage):
-        before.voltage_2_V = before.voltage_1_V if seen.samples > 1 else voltage
-        before.voltage_1_V, before.time_1_s, before.current_1_A = voltage, seen.time_s, current
-    seen.current_A = current
+        before.voltage_2_V = before.voltage_1_V if evidence.samples > 1 else voltage
+        before.voltage_1_V, before.time_1_s, before.current_1_A = voltage, evidence.time_s, current
+    evidence.current_A = current
 
 
 @compiled
@@ -284,37 +270,37 @@ def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> N
 
 
 @compiled
-def unseen_C(seen: Row) -> float:
+def unseen_C(evidence: Row) -> float:
     """The standard deviation of the charge by all that nobody saw."""
-    rest = seen.rest
-    beside_C = hypot(rest.load_on_C, rest.mean_A * (seen.time_s - rest.over_s)) if rest.is_over else 0.0
-    between_C = hypot(gaps.doubtful_C(seen), 0.0 if seen.is_counted else switched_C(seen.switches))
-    return hypot(hypot(hypot(beside_C, seen.uncounted_C), hypot(between_C, seen.dropped_C)), seen.left_C)
+    rest = evidence.rest
+    beside_C = hypot(rest.load_on_C, rest.mean_A * (evidence.time_s - rest.over_s)) if rest.is_over else 0.0
+    between_C = hypot(gaps.doubtful_C(evidence), 0.0 if evidence.is_counted else switched_C(evidence.switches))
+    return hypot(hypot(hypot(beside_C, evidence.uncounted_C), hypot(between_C, evidence.dropped_C)), evidence.left_C)
 
 
 @compiled
-def is_smeared(seen: Row) -> bool:
+def is_smeared(evidence: Row) -> bool:
     """Whether the load is switched between samples so often that they do not tell which current a voltage belongs to."""
-    return bool(switched_C(seen.switches) > _MOST_SHARE * seen.drawn_C)
+    return bool(switched_C(evidence.switches) > _MOST_SHARE * evidence.drawn_C)
 
 
 @compiled
-def doubt_condition(seen: Row, sd_C: float) -> int:
+def doubt_reason(evidence: Row, sd_C: float) -> int:
     """Say which charge that nobody saw makes most of a standard deviation of ``q_mobile``; 0 if none does."""
-    rest, most_C = seen.rest, MOST_OF_SD * sd_C
+    rest, most_C = evidence.rest, MOST_OF_SD * sd_C
     if rest.is_over and rest.load_on_C > most_C:
-        return Condition.LOAD_ON_UNSURE + 0
-    if rest.is_over and abs(rest.mean_A) * (seen.time_s - rest.over_s) > most_C:
-        return Condition.REST_CURRENT + 0
-    if seen.left_C > most_C:
-        return Condition.TAPERED_EARLY + 0
-    if seen.uncounted_C > most_C:
-        return Condition.UNCOUNTED + 0
-    if seen.dropped_C > most_C:
-        return Condition.Q_DROPPED + 0
-    if not seen.is_counted and switched_C(seen.switches) > most_C:
-        return Condition.Q_SWITCHES + 0
-    return Condition.GAP_UNSURE + 0 if sd_C < inf and gaps.doubtful_C(seen) > 0.0 else 0
+        return Reason.LOAD_ON_UNSURE + 0
+    if rest.is_over and abs(rest.mean_A) * (evidence.time_s - rest.over_s) > most_C:
+        return Reason.REST_CURRENT + 0
+    if evidence.left_C > most_C:
+        return Reason.TAPERED_EARLY + 0
+    if evidence.uncounted_C > most_C:
+        return Reason.UNCOUNTED + 0
+    if evidence.dropped_C > most_C:
+        return Reason.Q_DROPPED + 0
+    if not evidence.is_counted and switched_C(evidence.switches) > most_C:
+        return Reason.Q_SWITCHES + 0
+    return Reason.GAP_UNSURE + 0 if sd_C < inf and gaps.doubtful_C(evidence) > 0.0 else 0
 
 
 @compiled
@@ -326,78 +312,80 @@ def _least_resistance_ohm(start: Row, q_mobile: float, r_o: float) -> float:
 
 
 @compiled
-def _note_start(seen: Row, voltage: float, current: float, cell_q_mobile: float) -> None:
-    start = seen.start
-    if seen.samples == 1:
-        if start.is_cut_short and voltage < seen.start_V:
+def _note_start(evidence: Row, voltage: float, current: float, cell_q_mobile: float) -> None:
+    start = evidence.start
+    if evidence.samples == 1:
+        if start.is_cut_short and voltage < evidence.start_V:
             # its charge left what the voltage at rest is too low by
-            seen.left_C = LACKING_SHARE * cell_q_mobile * (seen.start_V - voltage) / (seen.start_V - seen.low_V)
+            evidence.left_C = (
+                LACKING_SHARE * cell_q_mobile * (evidence.start_V - voltage) / (evidence.start_V - evidence.low_V)
+            )
         start.first_V, start.first_A, start.most_A, start.least_V = voltage, current, current, voltage
         if start.at_rest:
             start.first_A = 0.0
-    elif seen.samples == 2 or seen.time_s <= _START_WINDOW_S:
+    elif evidence.samples == 2 or evidence.time_s <= _START_WINDOW_S:
         start.most_A = max(start.most_A, current)
         if not isnan(voltage):
             start.least_V = min(start.least_V, voltage)
 
 
 @compiled
-def start_condition(seen: Row) -> int:
+def start_reason(evidence: Row) -> int:
     """
     Say why a cell need not have started with the charge expected; 0 if its first voltage shows that it did. Under load that
     is lower than at rest by a drop that nobody knows: a cell with a larger one cannot be told from one that lacks some charge.
     """
-    start = seen.start
-    if start.first_V > seen.start_V + ABOVE_REST_V:
-        return Condition.START_ABOVE + 0
+    start = evidence.start
+    if start.first_V > evidence.start_V + ABOVE_REST_V:
+        return Reason.START_ABOVE + 0
     if start.charge < 0:
-        return Condition.START_CHARGED + 0
-    if start.charge > 0 or not start.first_V < seen.low_V:
+        return Reason.START_CHARGED + 0
+    if start.charge > 0 or not start.first_V < evidence.low_V:
         return 0
-    return Condition.START_BELOW + 0 if start.first_A <= LOAD_SHARE * start.most_A else Condition.START_LOADED + 0
+    return Reason.START_BELOW + 0 if start.first_A <= LOAD_SHARE * start.most_A else Reason.START_LOADED + 0
 
 
 @compiled
-def fault_condition(seen: Row) -> int:
+def fault_reason(evidence: Row) -> int:
     """Say what the samples show that no cell does, the first one found; 0 if nothing."""
-    return Condition.NOT_FOLLOWED + 0 if seen.pending else seen.fault.condition
+    return Reason.NOT_FOLLOWED + 0 if evidence.pending else evidence.fault.reason
 
 
 @compiled
-def belongs(seen: Row) -> bool:
+def belongs(evidence: Row) -> bool:
     """Whether the last voltage belongs to its current: it follows that, and would follow a model of it."""
-    back_s = seen.switch.back_s
-    return not seen.pending and (back_s == 0.0 or seen.time_s > back_s + _START_WINDOW_S)
+    back_s = evidence.switch.back_s
+    return not evidence.pending and (back_s == 0.0 or evidence.time_s > back_s + _START_WINDOW_S)
 
 
 @compiled
-def _is_followed(seen: Row, time_s: float, lowest_V: float, highest_V: float, resistance_ohm: float) -> bool:
+def _is_followed(evidence: Row, time_s: float, lowest_V: float, highest_V: float, resistance_ohm: float) -> bool:
     # whether the voltage follows the last switch of the load by half of the least ohmic drop that it can have by then, or that
     # drop is no more than noise
-    switch = seen.switch
+    switch = evidence.switch
     drop_V = -resistance_ohm * switch.to_follow_A * expm1((switch.time_s - time_s) / _FOLLOWS_S)
     followed_V = switch.before_V - (lowest_V if drop_V > 0.0 else highest_V)
-    return abs(drop_V) <= noise_V(seen) or followed_V / drop_V >= 0.5
+    return abs(drop_V) <= noise_V(evidence) or followed_V / drop_V >= 0.5
 
 
 @compiled
-def _take_back(seen: Row, current: float, most_q: float, r_o: float) -> bool:
+def _take_back(evidence: Row, current: float, most_q: float, r_o: float) -> bool:
     # A switch that the voltage did not follow, and that was taken back, was none: what it made of the charge is in doubt
-    switch, last = seen.switch, seen.examined
+    switch, last = evidence.switch, evidence.examined
     if abs(switch.size_A) > SWITCH_SHARE * last.largest_A:
         return False
-    seen.dropped_C += abs(switch.charge_C)
-    seen.dropped_ohm += abs(r_o - switch.before_ohm)
-    if seen.dropped_C > _MOST_SHARE * most_q:
-        find(seen, Condition.NOT_FOLLOWED, switch.time_s, 0.0, current - last.current_A)
-    last.lagging_A, switch.size_A, switch.back_s = current, 0.0, seen.time_s
+    evidence.dropped_C += abs(switch.charge_C)
+    evidence.dropped_ohm += abs(r_o - switch.before_ohm)
+    if evidence.dropped_C > _MOST_SHARE * most_q:
+        find(evidence, Reason.NOT_FOLLOWED, switch.time_s, 0.0, current - last.current_A)
+    last.lagging_A, switch.size_A, switch.back_s = current, 0.0, evidence.time_s
     return True
 
 
 @compiled
-def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
+def _note_switch(evidence: Row, time_s: float, current: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
     # whether the load jumped, or was switched, since the last sample that was examined
-    switch, last = seen.switch, seen.examined
+    switch, last = evidence.switch, evidence.examined
     last.largest_A = max(last.largest_A, abs(current))
     if last.count == 0:
         switch.time_s = last.jump_s = time_s
@@ -407,17 +395,17 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
     if abs(switched_A) > min(SWITCH_SHARE * last.largest_A, _LEAST_JUMP_A):
         last.jump_s = time_s
     if abs(switched_A) > SWITCH_SHARE * last.largest_A:
-        if _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):  # or nothing was left to follow
+        if _is_followed(evidence, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):  # or nothing was left to follow
             switch.size_A = 0.0
         if switch.size_A == 0.0:
             switch.charge_C, switch.before_ohm = 0.0, r_o
             # the last row before a switch may already have the voltage after it
             highest_V, lowest_V = max(last.earlier_V, last.voltage_V), min(last.earlier_V, last.voltage_V)
             switch.time_s, switch.before_V = time_s, highest_V if switched_A > 0.0 else lowest_V
-            switch.lowest_V = switch.highest_V = seen.before.voltage_1_V
+            switch.lowest_V = switch.highest_V = evidence.before.voltage_1_V
         # steps the same way before it was judged are one switch: a mean over an interval shows a switch as two
         switch.size_A += switched_A
-        if _take_back(seen, current, most_q, r_o):
+        if _take_back(evidence, current, most_q, r_o):
             return
         # the ohmic drop must follow little after a pulse too short for it to build up
         switch.to_follow_A = max(min(current - last.lagging_A, max(switch.size_A, 0.0)), min(switch.size_A, 0.0))
@@ -426,17 +414,17 @@ def _note_switch(seen: Row, time_s: float, current: float, resistance_ohm: float
 
 
 @compiled
-def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> None:
+def _look_for_rise(evidence: Row, time_s: float, voltage: float, current: float) -> None:
     # since the voltage a little more than the window ago, under a current that has been steady since long before
-    ring = seen.ring
+    ring = evidence.ring
     for back in range(2, min(ring.n_kept, KEPT) + 1):
         n = (ring.n_kept - back) % KEPT
         since_s = time_s - ring.time_s[n]
         if since_s > _START_WINDOW_S:
             rise_V = voltage - ring.voltage_V[n] - _MOST_RESISTANCE_OHM * max(ring.current_A[n] - current, 0.0)
-            was_steady = time_s - since_s - seen.examined.jump_s >= STEADY_S
-            if was_steady and rise_V > _RISE_V and rise_V > noise_V(seen):
-                find(seen, Condition.RISES, time_s - since_s, 0.0, rise_V)
+            was_steady = time_s - since_s - evidence.examined.jump_s >= STEADY_S
+            if was_steady and rise_V > _RISE_V and rise_V > noise_V(evidence):
+                find(evidence, Reason.RISES, time_s - since_s, 0.0, rise_V)
             break
     if ring.n_kept == 0 or time_s - ring.time_s[(ring.n_kept - 1) % KEPT] >= _KEPT_EVERY_S:
         n = ring.n_kept % KEPT
@@ -445,29 +433,29 @@ def _look_for_rise(seen: Row, time_s: float, voltage: float, current: float) -> 
 
 
 @compiled
-def _examine_last(seen: Row, voltage: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
+def _examine_last(evidence: Row, voltage: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
     # The sample before the one at hand, with the middle voltage of three, which is no single wild one
-    last, switch, before = seen.examined, seen.switch, seen.before
+    last, switch, before = evidence.examined, evidence.switch, evidence.before
     time_s, current = before.time_1_s, before.current_1_A
     if switch.size_A != 0.0:
         # some loggers write a voltage a sample later than its current: the first one after a switch may belong before it
         switch.lowest_V, switch.highest_V = min(switch.lowest_V, before.voltage_1_V), max(switch.highest_V, before.voltage_1_V)
-    _note_switch(seen, time_s, current, resistance_ohm, most_q, r_o)
+    _note_switch(evidence, time_s, current, resistance_ohm, most_q, r_o)
     if switch.size_A != 0.0 and time_s - switch.time_s > _START_WINDOW_S:
-        if not _is_followed(seen, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
-            find(seen, Condition.NOT_FOLLOWED, switch.time_s, 0.0, switch.size_A)
+        if not _is_followed(evidence, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
+            find(evidence, Reason.NOT_FOLLOWED, switch.time_s, 0.0, switch.size_A)
         switch.size_A = 0.0
-    _look_for_rise(seen, time_s, voltage, current)
+    _look_for_rise(evidence, time_s, voltage, current)
     # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
     whole_V = resistance_ohm * max(current, 0.0)
     drop_V = whole_V if time_s - switch.time_s > _START_WINDOW_S else 0.0
-    if seen.drawn_C > _RECOVERY_SHARE * most_q:
-        if seen.share_V == 0.0:
-            seen.share_V = voltage + whole_V
+    if evidence.drawn_C > _RECOVERY_SHARE * most_q:
+        if evidence.share_V == 0.0:
+            evidence.share_V = voltage + whole_V
         # on a flat curve, or with a smaller drop than that, it never was much lower
-        is_high = voltage + drop_V > max(seen.low_V, seen.share_V + _RISE_V)
+        is_high = voltage + drop_V > max(evidence.low_V, evidence.share_V + _RISE_V)
         if is_high and min(current, last.lagging_A) >= -REST_CURRENT_A:
-            find(seen, Condition.RECOVERED, time_s, 0.0, seen.drawn_C)
+            find(evidence, Reason.RECOVERED, time_s, 0.0, evidence.drawn_C)
     last.count += 1
     last.earlier_V = voltage if last.count == 1 else last.voltage_V
     last.time_s, last.voltage_V, last.current_A = time_s, voltage, current

@@ -20,8 +20,8 @@ KEPT = 32
 #: A change of more than so many standard deviations of the noise is not noise. The middle one of three samples has this share
 #: of their noise.
 NOISES, SMOOTHED_SHARE = 8.0, 0.67
-#: Under a current that was steady for so long, s, a voltage goes on as before.
-STEADY_S = 60.0
+#: Voltages are rounded, and no model is better than this, V.
+RESOLUTION_V = 1e-3
 # This many changes tell the noise.
 _LEAST_CHANGES = 4
 
@@ -38,18 +38,18 @@ def middle(a: float, b: float, c: float) -> float:
 
 
 @compiled
-def noise_V(seen: Row) -> float:
+def noise_V(evidence: Row) -> float:
     """What is more than noise; infinite as long as there are too few samples to tell."""
-    n = min(seen.ring.n_changes, KEPT)
+    n = min(evidence.ring.n_changes, KEPT)
     if n < _LEAST_CHANGES:
         return inf
-    change_V = seen.ring.change_V[:n]
+    change_V = evidence.ring.change_V[:n]
     return NOISES * SMOOTHED_SHARE * float(np.median(np.abs(change_V - np.median(change_V)))) / (0.6745 * sqrt(2.0))
 
 
 @compiled
-def find(seen: Row, condition: int, time_s: float, since_s: float, size: float) -> None:
+def find(evidence: Row, reason: int, time_s: float, since_s: float, size: float) -> None:
     """Note a fault; the first one is kept."""
-    fault = seen.fault
-    if fault.condition == 0:
-        fault.condition, fault.time_s, fault.since_s, fault.size = condition, time_s, since_s, size
+    fault = evidence.fault
+    if fault.reason == 0:
+        fault.reason, fault.time_s, fault.since_s, fault.size = reason, time_s, since_s, size

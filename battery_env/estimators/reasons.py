@@ -1,50 +1,26 @@
 """
-What speaks against an estimate: one table of conditions for least squares, the filter, policies and the closed form. Who makes
-an estimate notes which of them hold, and what was measured; the table has their order, their texts, and against which number
-each speaks.
+Why an estimate is not settled: one table of reasons for least squares, the filter, policies and the closed form, with their
+order, their texts, and against which number each speaks; and the limits that they name. :mod:`battery_env.estimators.verdict`
+goes by it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from enum import IntEnum
-from functools import lru_cache
 from itertools import permutations
-from math import comb
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from battery_env.arrays import BoolArray, FloatArray
-from battery_env.electrochemistry import CellParameters, initial_state, voltage
 from battery_env.parameters import PARAMETER_NAMES
 
 #: An estimate is settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a real
 #: cell the error of the model divided by the current is a quarter of it already.
 SETTLED_SHARES = {"q_mobile": 0.02, "r_o": 0.3}
-#: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
-PLAUSIBLE_Q_SHARES = (0.2, 5.0)
-#: The error of the model may be this much larger than stated before the residuals contradict it.
-MISMATCH_MARGIN = 2.0
-#: Where the noise is told from the residuals, their variance may exceed its by this share over the root of their number.
-EXCESS_LIMIT_UNSTATED = 10.0
-#: A voltage farther off than so many standard deviations of its noise shows an error of the model, or of the sensor.
-MOST_NOISE_SD = 3.0
 #: What makes most of a variance is the reason for it.
 MOST_OF_SD = 0.5**0.5
-#: So many samples more than parameters tell how large the noise is.
-SPARE_SAMPLES = 10
-#: A prior contradicts the record beyond so many standard deviations of their difference. Within it, a prior of the settled
-#: width moves no estimate by more than 5 %.
-PRIOR_LIMIT_SD = 2.5
-#: A full cell may rest so far below and above the model's voltage, V. Real ones of the bundled kind rest at 4.17 to 4.23 V,
-#: the model's at 4.19 V, which falls by 11 mV with each percent of the charge: a cell that lacks 4 % or more is noticed. Where
-#: that share makes less, on a flat curve, a cell may rest no farther below.
-BELOW_REST_V, ABOVE_REST_V, LACKING_SHARE = 0.04, 0.06, 0.04
 
 _AT_BOUND = "{} is at a bound of its search, where the record does not determine it."
-_DIFFERS = "The policy and the fit in its observation differ by {{differs:.1%}} in {}: it does not trust the fit."
+_DIFFERS = "The policy and the fit in its observation differ by {{differs_{0}:.1%}} in {1}: it does not trust the fit."
 _DROPPED = "The current changes for a moment, and the voltage does not follow: {} in doubt."
 _SWITCHES = (
     "The load is switched between two samples, nobody knows when, {{switches}} times: {}. Log a sample before and after each "
@@ -67,14 +43,14 @@ _IMPRECISE_R = (
 )
 
 
-class Condition(IntEnum):
+class Reason(IntEnum):
     """
     What speaks against an estimate, in the order in which it counts: of each number the first row that speaks against it is
     the reason. Most speak against both numbers, and come before those against one. Braces name what was measured. A row of
     ``q_mobile`` is followed by that of ``r_o``.
     """
 
-    def __new__(cls, text: str, *against: str) -> Condition:
+    def __new__(cls, text: str, *against: str) -> Reason:
         number = len(cls.__members__) + 1
         member = int.__new__(cls, number)
         member._value_ = number
@@ -170,8 +146,8 @@ class Condition(IntEnum):
     )
     # what the record does not tell of one number
     NO_CURRENT = "No current flows in the last step, so that R_o does not show.", "r_o"
-    Q_DIFFERS = _DIFFERS.format("q_max"), "q_mobile"
-    R_DIFFERS = _DIFFERS.format("R_o"), "r_o"
+    Q_DIFFERS = _DIFFERS.format("q_mobile", "q_max"), "q_mobile"
+    R_DIFFERS = _DIFFERS.format("r_o", "R_o"), "r_o"
     TAPERED_EARLY = (
         "The charge before the load ended while {charge_A:.3g} A still flowed: the cell had some {left_C:.0f} C left to take. "
         "Charge until less flows, or state initial_soc (--initial-soc).",
@@ -219,12 +195,12 @@ class Condition(IntEnum):
     # none of these
     SETTLED = ""
 
-    def of(self, name: str) -> Condition:
+    def of(self, name: str) -> Reason:
         """The row of a parameter, where this one is that of ``q_mobile``."""
-        return Condition.numbered(self + PARAMETER_NAMES.index(name))
+        return Reason.numbered(self + PARAMETER_NAMES.index(name))
 
     @staticmethod
-    def numbered(number: int) -> Condition:
+    def numbered(number: int) -> Reason:
         """The row of a number that compiled code found."""
         return _ROWS[number - 1]
 
@@ -233,90 +209,10 @@ class Condition(IntEnum):
         return self.text.format_map(measured)
 
 
-_ROWS = tuple(Condition)
-#: Those of a first voltage that is not that of the cell expected.
-STARTS = {Condition.START_ABOVE, Condition.START_CHARGED, Condition.START_BELOW, Condition.START_LOADED}
-
-
-class Verdict(NamedTuple):
-    """Which numbers of an estimate are settled, and why not both, by the names of :class:`~battery_env.Estimate`."""
-
-    settled_q_mobile: bool
-    settled_r_o: bool
-    reason: str
-
-    @classmethod
-    def of(cls, first: Sequence[int], r_o_comes_first: bool, said: Callable[[Condition], str]) -> Verdict:
-        """What follows from the first condition against each number, ``SETTLED`` where there is none."""
-        rows = [
-            number for number in dict.fromkeys(reversed(first) if r_o_comes_first else first) if number != Condition.SETTLED
-        ]
-        reason = " ".join(said(Condition.numbered(number)) for number in rows)
-        return cls(first[0] == Condition.SETTLED, first[1] == Condition.SETTLED, reason)
-
-
-class Diagnosis:
-    """What speaks against one estimate: the conditions that hold, each with what was measured of it."""
-
-    def __init__(self) -> None:
-        self.measured: dict[Condition, Mapping[str, Any]] = {}
-
-    def note(self, condition: Condition, holds: bool = True, /, **measured: Any) -> None:
-        """Note that a condition holds, if it does."""
-        if holds:
-            self.measured.setdefault(condition, measured)
-
-    def verdict(self, values: Mapping[str, float], sds: Mapping[str, float]) -> Verdict:
-        """
-        Which numbers are settled, by their values and standard deviations as the record alone has them, and why not both:
-        first why not the one that is farther beyond its limit.
-        """
-        noted = [[row for row in self.measured if name in row.against] for name in PARAMETER_NAMES]
-        first = [min(rows, default=Condition.SETTLED) for rows in noted]
-        limit_q, limit_r_o = (SETTLED_SHARES[name] * values[name] for name in PARAMETER_NAMES)
-        r_o_comes_first = sds["r_o"] * limit_q > sds["q_mobile"] * limit_r_o
-        return Verdict.of(first, r_o_comes_first, lambda row: row.said(self.measured.get(row, {})))
+_ROWS = tuple(Reason)
 
 
 def is_only_imprecise(reason: str) -> bool:
     """Return whether an estimate is not settled by its precision alone: nothing in the record contradicts it."""
-    texts = [row.text for row in Condition if Condition.Q_PRIOR_ALONE <= row < Condition.SETTLED]
+    texts = [row.text for row in Reason if Reason.Q_PRIOR_ALONE <= row < Reason.SETTLED]
     return reason in {*texts, *map(" ".join, permutations(texts, 2))}
-
-
-def start_measured(first_V: float, rest_V: float, initial_soc: float = 1.0) -> dict[str, Any]:
-    """What is said of the start of a record: its first voltage, and what a cell at rest shows with the charge expected."""
-    expected, advice = f"a cell with {initial_soc:.0%} of its charge", "State another initial_soc (--initial-soc)."
-    if initial_soc == 1.0:
-        expected = "a full cell"
-        advice = "Give the whole discharge of a full cell, with the rest before it, or state initial_soc (--initial-soc)."
-    return {"first_V": first_V, "rest_V": rest_V, "expected": expected, "start_advice": advice}
-
-
-@lru_cache(maxsize=64)
-def rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
-    """The voltage of a cell at rest."""
-    return float(voltage(initial_state(cell=cell, soc=soc), cell=cell))
-
-
-def low_rest_voltage_V(cell: CellParameters, soc: float = 1.0) -> float:
-    """The voltage below which a cell at rest lacks charge."""
-    expected_V = rest_voltage_V(cell, soc)
-    fall_V = expected_V - rest_voltage_V(cell, 1.0 - LACKING_SHARE)
-    # another charge was stated by whoever knows it, and constants of one load need not have a curve that rises
-    return expected_V - (min(BELOW_REST_V, fall_V) if soc == 1.0 and fall_V > 0.0 else BELOW_REST_V)
-
-
-def is_plausible(q_mobile: ArrayLike, cell: CellParameters) -> BoolArray:
-    """Return whether a cell of the kind of the model can have some ``q_mobile``."""
-    low, high = PLAUSIBLE_Q_SHARES
-    share = np.asarray(q_mobile) / cell.q_mobile
-    return np.asarray((share > low) & (share < high))
-
-
-def white_noise_V(residual_V: FloatArray, order: int = 1) -> float:
-    """
-    Return the standard deviation of the white part of residuals: from their differences from sample to sample, which hardly
-    hold what drifts, by the median, which leaves single wild samples aside.
-    """
-    return float(np.median(np.abs(np.diff(residual_V, order))) / (0.6745 * np.sqrt(comb(2 * order, order))))

@@ -1,5 +1,5 @@
 """
-What a policy that follows a stream has been shown so far: samples at any intervals, each with the time since the first one, s,
+The stream that a policy follows: samples so far at any intervals, each with the time since the first one, s,
 the voltage, V, NaN where it is missing, and the current until the next one, A.
 """
 

@@ -1,0 +1,176 @@
+"""
+Which numbers of an estimate are settled, and why not both: one function of an estimate, its standard deviations and the
+evidence of its record, for least squares, the filter, policies and the closed form; compiled (numba), as the filter asks after
+each sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from math import comb, hypot, nan, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from battery_env.arrays import FloatArray
+from battery_env.compiled import compiled
+from battery_env.estimators.diagnosis.evidence import EVIDENCE, doubt_reason, fault_reason, is_smeared, start_reason
+from battery_env.estimators.diagnosis.faults import RESOLUTION_V, Row, table
+from battery_env.estimators.reasons import MOST_OF_SD, SETTLED_SHARES, Reason
+from battery_env.parameters import PARAMETER_NAMES
+
+#: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
+PLAUSIBLE_Q_SHARES = (0.2, 5.0)
+#: The error of the model may be this much larger than stated before the residuals contradict it.
+MISMATCH_MARGIN = 2.0
+#: A voltage farther off than so many standard deviations of its noise shows an error of the model, or of the sensor.
+MOST_NOISE_SD = 3.0
+#: So many samples more than parameters tell how large the noise is.
+SPARE_SAMPLES = 10
+#: A prior contradicts the record beyond so many standard deviations of their difference. Within it, a prior of the settled
+#: width moves no estimate by more than 5 %.
+PRIOR_LIMIT_SD = 2.5
+# Residuals whose variance is so many of its standard deviations above the one expected are not noise; and where the noise is
+# told from the residuals themselves, by so large a share over the root of their number.
+_EXCESS_LIMIT, _EXCESS_LIMIT_UNSTATED = 5.0, 10.0
+
+_SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"])
+# By number of a reason, which of both it speaks against.
+_AGAINST = np.array([[False, False], *([name in row.against for name in PARAMETER_NAMES] for row in Reason)])
+
+#: An estimate and its verdict; pairs are of ``q_mobile`` (C) and ``r_o`` (ohm): the values, their standard deviations with all
+#: that is known and by the record alone, whether they are searched for and whether they have a prior; the first reason against
+#: each, and whether that against ``r_o`` is the larger doubt.
+JUDGED = table(
+    [
+        *((name, "f8", 2) for name in ("value", "sd", "own_sd")),
+        *((name, "i8", 2) for name in ("is_searched", "has_prior", "reason")),
+        ("r_o_comes_first", "b1"),
+    ]
+)
+
+
+class Assumptions(NamedTuple):
+    """What is taken for known beside a record, and shows nowhere in its voltage."""
+
+    gain_sd: float = 0.0  # of the current sensor, which scales both parameters
+    sd_soc: float = 0.0  # of the charge at the start, as a share of it
+    cell_sd_r_o: float = 0.0  # what the constants of the cell leave open of ``r_o``, ohm
+    is_along_path: bool = False  # whether these constants lie along a path of aging cells
+
+
+@compiled
+def note(judged: Row, reason: int, holds: bool) -> None:
+    """Note a reason, if it holds: against each number that it speaks against, the row of the table that comes first counts."""
+    row = reason + 0  # a member of an enumeration is no index in older versions of numba
+    for k in range(2):
+        if holds and _AGAINST[row, k] and row < judged.reason[k]:
+            judged.reason[k] = row
+
+
+@compiled
+def judge(judged: Row, evidence: Row, known: Assumptions) -> None:
+    """Note what the samples of a record and the standard deviations of an estimate say against it."""
+    start, fault = start_reason(evidence), fault_reason(evidence)
+    note(judged, start, start > 0)
+    note(judged, fault, fault > 0)
+    note(judged, Reason.R_SWITCHES, judged.is_searched[1] > 0 and is_smeared(evidence))
+    beyond_q = beyond_r_o = 0.0  # in standard deviations that a settled one may have
+    for k in range(2):
+        if judged.is_searched[k] == 0:
+            continue
+        sd, own_sd, most_sd, is_r_o = judged.sd[k], judged.own_sd[k], _SHARES[k] * judged.value[k], k == 1
+        note(judged, Reason.Q_PRIOR_ALONE + k, judged.has_prior[k] > 0 and not own_sd < most_sd)
+        if not sd < most_sd:
+            doubt = 0 if is_r_o else doubt_reason(evidence, sd)
+            note(judged, doubt, doubt > 0)
+            note(judged, Reason.R_DROPPED, is_r_o and evidence.dropped_ohm > MOST_OF_SD * sd)
+            note(judged, Reason.R_OF_CONSTANTS, is_r_o and known.cell_sd_r_o > MOST_OF_SD * sd)
+            note(judged, Reason.PATH_UNTESTED, not is_r_o and known.is_along_path)
+            scale_sd = known.gain_sd if is_r_o else hypot(known.gain_sd, known.sd_soc)
+            note(judged, Reason.Q_SCALE_UNKNOWN + k, scale_sd >= _SHARES[k])
+            note(judged, Reason.Q_IMPRECISE + k, True)
+        if is_r_o:
+            beyond_r_o = max(sd, own_sd) / most_sd
+        else:
+            beyond_q = max(sd, own_sd) / most_sd
+    judged.r_o_comes_first = beyond_r_o > beyond_q
+
+
+class Verdict(NamedTuple):
+    """Which numbers of an estimate are settled, and why not both, by the names of :class:`~battery_env.Estimate`."""
+
+    settled_q_mobile: bool
+    settled_r_o: bool
+    reason: str
+
+    @classmethod
+    def of(cls, first: Sequence[int], r_o_comes_first: bool, measured: Mapping[str, Any]) -> Verdict:
+        """What follows from the first reason against each number; texts are filled with what was measured."""
+        in_order = dict.fromkeys(reversed(first) if r_o_comes_first else first)
+        texts = [Reason.numbered(row).said(measured) for row in in_order if row != Reason.SETTLED]
+        return cls(first[0] == Reason.SETTLED, first[1] == Reason.SETTLED, " ".join(texts))
+
+
+class Diagnosis:
+    """
+    What speaks against the estimate of one whole record.
+
+    :param evidence: what its samples show, a row of ``EVIDENCE``; ``None``: nothing
+    :param measured: what texts say of them, by the names in their braces
+    """
+
+    def __init__(self, evidence: Any = None, measured: Mapping[str, Any] | None = None) -> None:
+        self._evidence = np.zeros(1, EVIDENCE)[0] if evidence is None else evidence
+        self._measured = dict(measured or {})
+        self._judged = np.zeros(1, JUDGED)[0]
+        self._judged["reason"] = Reason.SETTLED
+
+    def note(self, reason: Reason, holds: bool = True, /, **measured: Any) -> None:
+        """Note that a reason holds, if it does, with what was measured of it."""
+        if holds:
+            note(self._judged, reason, True)
+            self._measured = measured | self._measured
+
+    def verdict(
+        self,
+        values: Mapping[str, float],
+        sds: Mapping[str, float],
+        searched: Collection[str] = (),
+        priors: Collection[str] = (),
+        known: Assumptions | None = None,
+    ) -> Verdict:
+        """
+        Which numbers are settled, by their values and standard deviations as the record alone has them, of those that were
+        searched for, and why not both: first why not the one that is farther beyond its limit.
+        """
+        judged = self._judged
+        judged["value"] = [values[name] for name in PARAMETER_NAMES]
+        judged["sd"] = judged["own_sd"] = [sds.get(name, nan) for name in PARAMETER_NAMES]
+        judged["is_searched"] = [name in searched for name in PARAMETER_NAMES]
+        judged["has_prior"] = [name in priors for name in PARAMETER_NAMES]
+        judge(judged, self._evidence, known or Assumptions())
+        return Verdict.of(judged["reason"].tolist(), bool(judged["r_o_comes_first"]), self._measured)
+
+
+@compiled
+def is_plausible(q_mobile: float, cell_q_mobile: float) -> bool:
+    """Whether a cell of the kind of the model can have some ``q_mobile``."""
+    least, most = PLAUSIBLE_Q_SHARES
+    return bool(least * cell_q_mobile < q_mobile < most * cell_q_mobile)
+
+
+def misfit_limit_V2(
+    noise_V: float, samples: int, mismatch_V: float, is_noise_stated: bool = False, negligible_V: float = RESOLUTION_V
+) -> float:
+    """The mean square of residuals, V^2, that noise and error of the model explain."""
+    excess = _EXCESS_LIMIT * sqrt(2.0 / samples) if is_noise_stated else _EXCESS_LIMIT_UNSTATED / sqrt(samples)
+    return noise_V**2 * (1.0 + excess) + (MISMATCH_MARGIN * mismatch_V) ** 2 + negligible_V**2
+
+
+def white_noise_V(residual_V: FloatArray, order: int = 1) -> float:
+    """
+    Return the standard deviation of the white part of residuals: from their differences from sample to sample, which hardly
+    hold what drifts, by the median, which leaves single wild samples aside.
+    """
+    return float(np.median(np.abs(np.diff(residual_V, order))) / (0.6745 * np.sqrt(comb(2 * order, order))))
