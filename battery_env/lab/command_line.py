@@ -29,14 +29,17 @@ from battery_env.estimators.cell_fit import CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.estimators.joint_fit import fit_cell
 from battery_env.estimators.search import spread_over
-from battery_env.files import check_new, finite_or_none
+from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.lab.many import calibrate_all
-from battery_env.lab.readers.columns import FileFormat
+from battery_env.lab.readers.columns import FileFormat, description, recognise
+from battery_env.lab.readers.tables import open_file
+from battery_env.lab.readers.testers import find_tester, tester_file
 from battery_env.lab.report import line_of, text_of
 from battery_env.lab.results import Outcome, Results
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.lab.sources import Source, find_sources, read_source
 from battery_env.lab.workers import interruptible, workers
+from battery_env.loads import constant
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
@@ -93,6 +96,16 @@ def _initial_soc(text: str) -> InitialSoc | Literal["rest"]:
     return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
 
 
+def _drawn(text: str) -> tuple[list[float], list[float], str]:
+    try:
+        load = constant(float(text), "current")
+    except ValueError:
+        from battery_env.lab.running import read_load  # here, as matplotlib takes long to import
+
+        load = read_load(text)
+    return load.start_s.tolist(), load.value.tolist(), load.unit
+
+
 _Options = dict[tuple[str, ...], dict[str, Any]]
 
 _FILES: _Options = {
@@ -106,6 +119,12 @@ _FILES: _Options = {
         "type": _assignments,
         "metavar": "time=UNIT,...",
         "help": "their units, where the names do not tell: s, ms, min, h; V, mV; A, mA; degC, K",
+    },
+    ("--tester",): {
+        "type": find_tester,
+        "metavar": "FILE.toml",
+        "help": "how the tester writes its tables: a file that the command columns begins, or the name of one that is known "
+        "(default: told from the names)",
     },
     ("--ignore",): {
         "action": "append",
@@ -248,6 +267,14 @@ def _parser(name: str) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
     _add(parser.add_argument_group("calibration"), _CALIBRATION, default=argparse.SUPPRESS)
     _add(parser.add_argument_group("results"), _RESULTS)
+    parser.add_argument(
+        "--load",
+        dest="drawn",
+        type=_drawn,
+        metavar="A|FILE.csv",
+        help="the load of a file that holds no current: a number of A from its first row on, or time_s, from 0 at the first "
+        "row, and current_A or power_W, each held until the next",
+    )
     return parser
 
 
@@ -429,7 +456,8 @@ def _calibrate(
 
 
 def _file_format(options: argparse.Namespace) -> FileFormat:
-    return FileFormat(options.columns, options.units, options.discharge_is_negative, options.ignore)
+    load = getattr(options, "drawn", None)
+    return FileFormat(options.columns, options.units, options.discharge_is_negative, options.ignore, options.tester, load)
 
 
 def _settings(options: argparse.Namespace) -> Settings:
@@ -515,10 +543,37 @@ def page(arguments: Sequence[str] | None = None, name: str = "python -m battery_
     return subprocess.run([sys.executable, "-m", "streamlit", "run", script, *local], check=False).returncode
 
 
+@_ending
+def columns(arguments: Sequence[str] | None = None, name: str = "python -m battery_env columns") -> int:
+    """The command ``columns``; its exit status is 3 if the table lacks what a record needs."""
+    parser = argparse.ArgumentParser(
+        prog=name,
+        description="Show the first lines of a table and what is recognised of it, and write a file to fill in: how its "
+        "tester names its columns, for --tester of the other commands.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("record", type=Path, metavar="FILE", help="of a tester")
+    parser.add_argument("--out", type=Path, default=Path("my_tester.toml"), metavar="FILE.toml", help="default: %(default)s")
+    parser.add_argument("--tester", type=find_tester, metavar="FILE.toml", help="what is known of the tester so far")
+    options = parser.parse_args(arguments)
+    check_new(options.out)
+    file_format = FileFormat(tester=options.tester)
+    with _saying():
+        opened = open_file(options.record, file_format)
+        found = recognise(opened.names, file_format, opened.rows)
+    print(description(opened.names, opened.rows, found))
+    with replacing(options.out, new=True) as part:
+        part.write_text(tester_file(found.columns, opened.names, opened.rows), encoding="utf-8")
+    then = "Fill in what is not found" if found.missing else "Change what is wrong"
+    print(f"\nwritten: {options.out}. {then}, and calibrate: {_INSTALLED} {options.record} --tester {options.out}")
+    return NOT_SETTLED if found.missing else SETTLED
+
+
 # The commands beside calibrate, with what they are for.
 _OTHERS: dict[str, tuple[Callable[..., int], str]] = {
     "forecast": (forecast, "the end of a discharge in progress"),
     "fit": (fit, "the constants of a cell from a few of its discharges"),
+    "columns": (columns, "what is recognised of a table, and a file to fill in for a tester that is not known"),
     "page": (page, "all of it as a page in the browser"),
 }
 

@@ -195,7 +195,7 @@ def test_columns_and_units_can_be_stated(tmp_path):
         ({}, r"no column for the time, the voltage, the current among x, Voltage 1, .*--columns time=NAME"),
         ({"columns": columns | {"time": "y"}}, "there is no column 'y' for the time among x, Voltage 1"),
         ({"columns": columns, "units": {"time": "furlong"}}, "the unit 'furlong' of the column 'x' is not known for the time"),
-        ({"columns": {"energy": "x"}}, r"columns knows time, voltage, .*, got energy"),
+        ({"columns": {"energy": "x"}}, r"columns knows time, date, .*, got energy"),
     ):
         with pytest.raises(ValueError, match=message):
             read_discharges(path, **options)
@@ -242,7 +242,7 @@ def test_discharges_whose_charges_are_not_logged_need_a_number_or_a_clock_that_s
     with pytest.warns(UserWarning, match="the clock starts anew at rest, where another test begins: row 65"):
         assert [discharge.meta["cycle"] for discharge in read_discharges(tmp_path / "life.csv")] == [1, 2]
     pd.concat([parts[0], parts[1][CURRENT_A.argmax() :]]).to_csv(tmp_path / "life.csv", index=False)
-    with pytest.raises(ValueError, match=r"time_s must increase .* or number them in a column of the cycle"):
+    with pytest.raises(ValueError, match=r"the clock goes back: row 65 .* number the tests in a column of the cycle"):
         read_discharges(tmp_path / "life.csv")
     parts[1]["time_s"] += 9000.0
     pd.concat(parts).to_csv(tmp_path / "life.csv", index=False)
@@ -266,10 +266,10 @@ def test_discharges_whose_charges_are_not_logged_need_a_number_or_a_clock_that_s
             "the current must be finite, got nan in row ",
         ),
         (
-            {"voltage_V": ["4.1", "OVERLOAD", *map(str, VOLTAGE_V[2:])]},
+            {"voltage_V": ["4.1", *(9 * ["OVERLOAD"]), *map(str, VOLTAGE_V[10:])]},
             "'voltage_V' must hold numbers, got 'OVERLOAD' in row 2",
         ),
-        ({"current_A": 0.0 * TIME_S}, r"no current flows above 0\.02 A, .*: no discharge"),
+        ({"current_A": 0.0 * TIME_S}, "no current flows in any row: there is no discharge"),
         ({"current_A": 0.01 * np.sin(TIME_S)}, "cannot be told"),
         ({"voltage_V": 3.7}, "whether the current of a discharge is positive or negative cannot be told"),
         ({"Voltage(V)": VOLTAGE_V - 0.1}, "both 'voltage_V' and 'Voltage.V.' may be the voltage"),
@@ -299,7 +299,7 @@ CUT_SHORT = gzip.compress(b"time_s,voltage_V,current_A\n" + 200_000 * b"1,4.1,2\
         ("text.txt", b"Dear all,\nplease find the data attached.\n", "no column for the time"),
         ("cut.csv.gz", CUT_SHORT, "damaged"),
         ("no.csv.gz", b"time_s,voltage_V,current_A\n", "damaged"),
-        ("picture.csv", b"\x89PNG\x00\x00", "binary"),
+        ("picture.csv", b"\x89PNG\x00\x00\x0dIHDR", "binary"),
         ("cell.parquet", b"PAR1", "damaged, or no Parquet"),
         ("cell.mat", b"MATLAB", "damaged"),
         ("cell.h5", b"HDF", "export the records as CSV"),
@@ -346,7 +346,7 @@ def test_a_table_of_which_the_newest_row_comes_first_is_turned(names):
 def test_a_clock_that_runs_backwards_for_a_while_is_refused_with_the_row():
     table = life()
     table.loc[70:90] = table.loc[90:70:-1].to_numpy()
-    with pytest.raises(ValueError, match="the clock runs backwards: row 72 is at 4520 s, after 4550 s"):
+    with pytest.raises(ValueError, match="the clock goes back: row 72 and 19 more is at 4520 s, after 4550 s"):
         read_discharges(table)
 
 

@@ -1,4 +1,4 @@
-"""Which column of a table is which measurement, and in which unit: told from the names that testers give."""
+"""Which column of a table is which measurement, and in which unit: by the names of the testers' table, or as is stated."""
 
 from __future__ import annotations
 
@@ -6,54 +6,18 @@ import re
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import zip_longest
 from typing import NamedTuple
 from unicodedata import normalize
 
 from battery_env.checks import ZERO_CELSIUS_K
+from battery_env.lab.readers.testers import QUANTITIES, REQUIRED, TESTERS, Tester
 
-#: What a record must have.
-REQUIRED = ("time", "voltage", "current")
-
-# By quantity, the names it goes by. The first that a table has is taken: elapsed times before dates, and these before the
-# times of a step; a cell before one of its electrodes. Below them, what may stand in their place, or tells more of them.
-_NAMES = {
-    "time": "test time, total time, elapsed time, accumulated time, cumulative time, run time, record time, elapsed, "
-    "prog time, program time, program duration, programmdauer, test, time, relative time, testzeit, prüfzeit, gesamtzeit, "
-    "programmzeit, laufzeit, zeit, temps total, temps, tempo, tiempo, 总时间, 测试时间, 累计时间, 时间, 相对时间, seconds, t, "
-    "unix time, date time, timestamp, absolute time, dpt time, real time, system time, sys time, date, datum, datum uhrzeit, "
-    "zeitstempel, fecha, 绝对时间, 系统时间, 日期, step time, step duration, schrittzeit, schrittdauer, temps étape, "
-    "步骤时间, 工步时间",
-    "voltage": "voltage, cell voltage, terminal voltage, battery voltage, voltage measured, measured voltage, volts, volt, "
-    "vol, ewe ece, ecell, potential, cell potential, ewe, u, v, spannung, zellspannung, klemmenspannung, batteriespannung, "
-    "u cell, v cell, u zelle, tension cellule, u bat, v bat, u batt, v batt, vf, tension, tensión, tensao, tensão, "
-    "voltaje, 电压",
-    "current": "current, cell current, battery current, current measured, measured current, cur, curr, amps, amp, i, strom, "
-    "zellstrom, batteriestrom, i cell, i bat, i batt, im, courant, corriente, corrente, 电流",
-    "temperature": "temperature, cell temperature, temperature measured, surface temperature, surface temperature t1, "
-    "temperature t1, temperature 1, aux temperature, aux temperature 1, temp, temp 1, t1, log temp 001, temperatur, "
-    "zelltemperatur, température, temperatura, 温度, 电池温度, t cell, t",
-    "ambient": "ambient temperature, chamber temperature, environment temperature, ev temp, umgebungstemperatur",
-    "cycle": "cycle, cycle index, cycle number, cycle no, cycle count, cycle id, cyc, cyc count, cycle p, zyklus, "
-    "zyklusnummer, ciclo, 循环, 循环号, 循环序号",
-    "step": "step count, step, step index, step number, step no, step id, steps, ns, schritt, schrittnummer, etape, "
-    "étape, 工步, 工步号, 工步序号",
-    "state": "state, md, status, step type, mode, zustand, 状态, 工步类型, 工步状态",
-    "cell": "cell id, cell name, cell number, cell no, cell, battery id, battery, barcode, serial number, channel, "
-    "channel id, channel number, zelle",
-    "step_time": "step time, step duration, schrittzeit, schrittdauer, temps étape, t step, 步骤时间, 工步时间",
-    "power": "power, p, leistung",
-    "charge_step": "dq",
-    "counter": "ece",
-    "capacity": "discharge capacity, dchg capacity, dchg cap, q discharge, discharged capacity, capacity, cap, ah, "
-    "entladekapazität, kapazität, 放电容量, 容量",
-}
-_RANKS = {
-    quantity: {name: rank for rank, name in enumerate(names.replace(" ", "").split(","))} for quantity, names in _NAMES.items()
-}
-# Names that are this quantity only where a unit says so: t may be a time, and p or q anything.
+#: What may stand in the place of a quantity that a record must have.
+INSTEAD = {"time": ("date", "step_time"), "current": ("power", "charge_step")}
+# Names that are this quantity only where a unit says so: t may be a time, and p, q or a capacity anything.
 _WITH_UNIT = {("temperature", "t"), ("power", "p"), ("charge_step", "dq"), ("counter", "ece")}
-_WITH_UNIT |= {("capacity", name) for name in _RANKS["capacity"]}
 
 
 def _units(factors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
@@ -76,20 +40,19 @@ _DEGREES = _units({"c degc degreec celsius deg": 1.0}) | dict.fromkeys(("k", "ke
 # By quantity and unit in lower case without blanks: factor and offset to s, V, A, degC, W and C.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "time": _TIMES,
-    "voltage": _VOLTS,
-    "current": _units({"a amp amps ampere amperes": 1.0, _MILLIAMPERES: 1e-3, "ua \u03bca microamp microamps": 1e-6}),
-    "temperature": _DEGREES,
-    "ambient": _DEGREES,
+    "date": _TIMES,
     "step_time": _TIMES,
+    "voltage": _VOLTS,
+    "counter": _VOLTS,
+    "current": _units({"a amp amps ampere amperes": 1.0, _MILLIAMPERES: 1e-3, "ua \u03bca microamp microamps": 1e-6}),
     "power": _units({"w watt watts": 1.0, "mw": 1e-3}),
     "charge_step": _CHARGES,
-    "counter": _VOLTS,
+    "temperature": _DEGREES,
+    "ambient": _DEGREES,
     "capacity": _CHARGES,
 }
-# What a record may have in place of a quantity.
-_INSTEAD = {"current": ("power", "charge_step")}
 _IN_BRACKETS = re.compile(
-    r"^(?P<name>.*?)\s*(?:\((?P<round>[^()]*)\)(?P<number>_\d+)?|\[(?P<square>[^][]*)\]|/\s*(?P<slash>[^/]+))\s*$"
+    r"^(?P<name>.*?) ?(?:\((?P<round>[^()]*)\)(?P<number>_\d+)?|\[(?P<square>[^][]*)\]|/ ?(?P<slash>[^/]+))$"
 )
 # Words end at a capital, too, as in TestTime; units may be in brackets of any kind, or behind a mark, or "in". A word of a
 # sentence, with a mark at its end, is no name.
@@ -98,13 +61,13 @@ _GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~{}/]|[,:](?=.)
 _DEGREE_SIGN = re.compile("^[Ââ]?[°º˚\ufffd?]")
 # A unit of text such as 1:02:03.5, which becomes seconds when it is read.
 _CLOCK = re.compile(r"\[?h+\]?:m+(?:in)?:s+(?:[.,]?(?:m?s+|f+|0+|x+|z+))?$")
-# So long are names that are a unit, as mV; a shorter one may be anything, as min.
-_LEAST_UNIT_NAME = {"time": 4, "voltage": 2, "current": 2, "capacity": 5}
 # What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
 _DISCHARGE = re.compile(r"\bd\b|\bdis\b|dch|dsg|disch|d[ée]charg|descarg|scaric|entlad|放电")
 _CHARGE = re.compile(r"\bc\b|ch|carg|caric|lad|充电")
 _NUMBER = re.compile(r"[-+.]*\d[-+.,:/\deE\sT]*$|nan$|true$|false$", flags=re.IGNORECASE)
-_FEW_WORDS, _AROUND_UNITS = 20, "[]()- "
+_AROUND_UNITS = "[]()- "
+# So long are names, and what is shown of a line; a column of words has so few of them.
+_LONGEST, _FEW_WORDS = 200, 20
 
 
 class Column(NamedTuple):
@@ -115,7 +78,11 @@ class Column(NamedTuple):
     factor: float = 1.0  # makes s, V or A of its values, or differences of temperature in K
     offset: float = 0.0  # is added then
     unit: str = ""  # as its name or the caller says, empty if neither does
-    words: str = ""  # its name without the unit, in lower case without gaps
+
+    @property
+    def is_of_cell(self) -> bool:
+        """Whether a voltage is that of a cell, and not of one of its electrodes against a third one."""
+        return "".join(_words(self.name)).removesuffix("v") != "ewe"
 
 
 @dataclass(frozen=True)
@@ -127,122 +94,168 @@ class FileFormat:
     :param units: by quantity, its unit
     :param discharge_is_negative: how the file counts the current of a discharge; ``None``: told from the voltage
     :param ignore: names of columns that are not looked at
+    :param tester: whose table it is; ``None``: told from the names
+    :param load: times in s and currents in A, or powers in W, of a load that the file does not hold, and its unit
     """
 
     columns: Mapping[str, str] | None = None
     units: Mapping[str, str] | None = None
     discharge_is_negative: bool | None = None
     ignore: Collection[str] = ()
+    tester: Tester | None = None
+    load: tuple[list[float], list[float], str] | None = None
 
 
-def find_columns(names: Sequence[str], file_format: FileFormat, rows: Iterable[Sequence[str]]) -> dict[str, Column]:
-    """
-    The columns of a record by quantity, from the names of all columns and the first rows, whose words may say which are
-    charges. Columns that may serve as well have the quantity and a number, as ``time 2``. A unit is told from the name, as in
-    ``Current(mA)``, ``Voltage / V``, ``mAmps`` or ``test_time_second``; a name without one is in s, V, A or degC. A unit of
-    another quantity rules a column out.
-    """
-    chosen, units, ignore = file_format.columns or {}, file_format.units or {}, [name.strip() for name in file_format.ignore]
-    for option, given in (("columns", chosen), ("units", units)):
-        if unknown := set(given) - set(_NAMES):
-            raise ValueError(f"{option} knows {', '.join(_NAMES)}, got {', '.join(sorted(unknown))}")
-    kept, rows = [name if (name := str(each).strip()) not in ignore else "" for each in names], list(rows)
-    labels = [_label(name, text) for name, text in zip_longest(kept, rows[0])] if rows and are_units(rows[0]) else kept
-    found: dict[str, Column] = {}
-    for quantity in _NAMES:
-        if "current" in found and quantity in _INSTEAD["current"]:
-            continue
-        places = _places(quantity, kept, labels, chosen.get(quantity), units.get(quantity))
-        if quantity == "state":
-            # a separator may end each row
-            of_words = _of_words(row[: len(kept)] for row in rows if len(row) >= len(kept))
-            places += [n for n in of_words if kept[n] and n not in places]
-        for number, place in enumerate(places, start=1):
-            words, unit = _split(labels[place], quantity)
-            column = Column(place, kept[place], *_scale(quantity, units.get(quantity, unit), kept[place]), words)
-            found[quantity if number == 1 else f"{quantity} {number}"] = column
-    missing = [quantity for quantity in REQUIRED if not {quantity, *_INSTEAD.get(quantity, ())} & set(found)]
-    if missing:
-        raise ValueError(
-            f"no column for the {', the '.join(missing)} among {', '.join(map(str, names))}. Say which it is: "
-            f"--columns {','.join(f'{quantity}=NAME' for quantity in missing)} (Python: columns)"
-        )
+class Recognised(NamedTuple):
+    """What is known of a table by its header."""
+
+    tester: Tester
+    columns: dict[str, Column]  # by quantity; what may serve as well has a number, as ``time 2``
+    missing: list[str]  # quantities that a record must have
+
+
+def find_columns(
+    names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]], source: str = "FILE"
+) -> Recognised:
+    """Columns by quantity, from all names and the first rows; refused, with what helps, where one is missing."""
+    found = recognise(names, file_format, rows)
+    if found.missing:
+        raise ValueError(_unknown(names, rows, found, source))
     return found
 
 
-def are_units(fields: Sequence[str]) -> bool:
-    """Whether the line below a header holds units, where some testers write them; a clock may have none."""
-    texts = [text for field in fields if (text := field.strip(_AROUND_UNITS))]
-    needed = (("voltage",), ("current", *_INSTEAD["current"]))
-    return not any(map(_NUMBER.match, texts)) and all(
-        any(_unit(text, quantity) for quantity in quantities for text in texts) for quantities in needed
-    )
+def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]]) -> Recognised:
+    """
+    Which tester's table it is, the first of whose row the table has all that a record needs, and its columns. A unit is told
+    from the name, as in ``Current(mA)``, ``Voltage / V``, ``mAmps`` or ``test_time_second``, or from the line below it; one of
+    another quantity rules a column out.
+    """
+    for option, stated in (("columns", file_format.columns), ("units", file_format.units)):
+        if unknown := set(stated or {}) - set(QUANTITIES):
+            raise ValueError(f"{option} knows {', '.join(QUANTITIES)}, got {', '.join(sorted(unknown))}")
+    ignore = {name.strip() for name in file_format.ignore}
+    kept = [name if (name := str(each).strip()) not in ignore else "" for each in names]
+    units = rows[0] if rows and are_units(rows[0]) else []
+    labels = [_label(name, text) for name, text in zip_longest(kept, units[: len(kept)])]
+    present = {key for name in labels for key, *_ in _readings(name)}
+    for tester in (file_format.tester,) if file_format.tester else TESTERS:
+        if tester is not TESTERS[-1] and tester.told_by and not present & set(map(_key, tester.told_by)):
+            continue
+        found = _columns_of(tester, kept, labels, rows, file_format)
+        given = {"current"} if file_format.load else set[str]()
+        missing = [each for each in REQUIRED if not {each, *INSTEAD.get(each, ())} & (set(found) | given)]
+        if not missing:
+            break
+    return Recognised(tester, found, missing)
 
 
-def count_required(names: Sequence[str], chosen: Mapping[str, str] | None = None) -> int:
-    """How much a line looks like the header of a record."""
-    chosen, names = chosen or {}, [str(name) for name in names if any(map(str.isalpha, str(name)))]
-    return sum(
-        (
-            any(name.strip() == chosen[quantity] for name in names)
-            if quantity in chosen
-            else any(_is_known(each, name) for each in (quantity, *_INSTEAD.get(quantity, ())) for name in names)
-        )
-        for quantity in REQUIRED
-    )
+def _columns_of(
+    tester: Tester, names: Sequence[str], labels: Sequence[str], rows: Sequence[Sequence[str]], file_format: FileFormat
+) -> dict[str, Column]:
+    chosen, units = file_format.columns or {}, {**tester.units, **(file_format.units or {})}
+    found: dict[str, Column] = {}
+    for quantity in QUANTITIES:
+        if quantity in INSTEAD["current"] and ("current" in found or file_format.load):
+            continue
+        used = {column.position for column in found.values()}
+        places = _places(tester, quantity, names, labels, chosen.get(quantity))
+        if quantity not in chosen:  # a column is one thing, but where the caller says otherwise
+            places = {n: unit for n, unit in places.items() if n not in used and names[n] not in chosen.values()}
+        if quantity == "state":
+            places |= {n: "" for n in _of_words(row[: len(names)] for row in rows if len(row) >= len(names)) if names[n]}
+        stated = (file_format.units or {}).get(quantity)
+        for place, unit in places.items():
+            if quantity not in (*REQUIRED, "state") and not stated and unit and not _unit(unit, quantity):
+                if quantity in _UNITS:
+                    say(f"the unit of {names[place]!r} is not known (--units {quantity}=UNIT). It is left out")
+                    continue
+            key = quantity if quantity not in found else f"{quantity} {place}"
+            found[key] = Column(
+                place, names[place], *_scale(quantity, stated or unit or units.get(quantity, ""), names[place])
+            )
+    return found
 
 
-def has(quantity: str, names: Sequence[str]) -> bool:
-    """Whether one of the names may be that of a quantity."""
-    return any(_is_known(quantity, name) for name in names)
+def _places(tester: Tester, quantity: str, names: Sequence[str], labels: Sequence[str], chosen: str | None) -> dict[int, str]:
+    """The columns that may be a quantity, those of the first name that there is, with the units that they tell."""
+    if chosen is not None:
+        place = next((n for n, name in enumerate(names) if name == chosen.strip()), None)
+        if place is None:
+            raise ValueError(f"there is no column {chosen!r} for the {quantity} among {', '.join(filter(None, names))}")
+        return {place: _stated_unit(labels[place], quantity)}
+    ranks = _ranks(tuple(tester.columns.get(quantity, ())))
+    matches = {n: match for n, label in enumerate(labels) if (match := _match(label, quantity, ranks, tester.units))}
+    if not matches:
+        return {}
+    # a unit that is not known is taken where no other column of the quantity has one
+    best = min((bool(unit and quantity in _UNITS and not _unit(unit, quantity)), rank) for rank, unit in matches.values())
+    places = {
+        n: unit
+        for n, (rank, unit) in matches.items()
+        if (bool(unit and quantity in _UNITS and not _unit(unit, quantity)), rank) == best
+    }
+    return places if quantity in REQUIRED else dict([next(iter(places.items()))])
 
 
-def unit_of(quantity: str, unit: str) -> tuple[float, float]:
-    """What the values of a quantity in some unit are multiplied with, and what is added then."""
-    return _UNITS[quantity][unit.lower()]
+@lru_cache(maxsize=1024)
+def _ranks(names: tuple[str, ...]) -> dict[str, int]:
+    return {_key(name): rank for rank, name in reversed([*enumerate(names)])}
 
 
-def direction(state: object) -> int:
-    """1 for what a tester calls a discharge, -1 for a charge, else 0."""
-    words = " ".join(_words(str(state)))
-    return 1 if _DISCHARGE.search(words) else -1 if _CHARGE.search(words) else 0
+def _match(label: str, quantity: str, ranks: Mapping[str, int], units: Mapping[str, str]) -> tuple[int, str] | None:
+    """The rank of a name among those of a quantity, and the unit in it; nothing if it is none, or its unit is of another."""
+    for key, unit, is_guess in _readings(label):
+        if key not in ranks or (is_guess and not _unit(unit, quantity)):
+            continue
+        unit = unit or _stated_unit(label, quantity)
+        needs_unit = (quantity, key) in _WITH_UNIT or (quantity == "capacity" and quantity not in units)
+        if (needs_unit and not _unit(unit, quantity)) or (
+            not _unit(unit, quantity) and any(_unit(unit, other) for other in _UNITS)
+        ):
+            return None
+        return ranks[key], unit
+    return None
 
 
-def _of_words(rows: Iterable[Sequence[str]]) -> list[int]:
-    """Columns of a few words."""
-    texts = [{text for value in values if (text := value.strip())} for values in zip(*rows, strict=False)]
-    return [n for n, words in enumerate(texts) if 0 < len(words) <= _FEW_WORDS and not any(map(_NUMBER.match, words))]
-
-
-def _words(name: str) -> list[str]:
-    return _GAP.sub(" ", name).lower().split()
-
-
-def _split(name: str, quantity: str) -> tuple[str, str]:
-    """A name in lower case without gaps, and the unit in it, which may be empty."""
-    name = normalize("NFKC", name)  # brackets may be as wide as a Chinese character
-    match, words, known, ranks = _IN_BRACKETS.match(name), _words(name), _UNITS.get(quantity, {}), _RANKS[quantity]
-    whole = "".join(words)
-    if match and whole not in ranks:
+@lru_cache(maxsize=4096)
+def _readings(name: str) -> tuple[tuple[str, str, bool], ...]:
+    """What a name may be without its unit, the unit, and whether that is a guess: the whole, what is in brackets, a word."""
+    name = " ".join(normalize("NFKC", name)[:_LONGEST].split())  # brackets may be as wide as a Chinese character
+    words, match = _words(name), _IN_BRACKETS.match(name)
+    found = [("".join(words), "", False)]
+    if match:
         unit = next(group for group in match.group("round", "square", "slash") if group is not None)
-        return "".join(_words(match["name"] + (match["number"] or ""))), unit.strip(" _")
-    if len(name) >= _LEAST_UNIT_NAME.get(quantity, len(name) + 1) and whole in known:
-        return next(each for each in ranks if each in known), whole
+        found.append((_key(match["name"] + (match["number"] or "")), unit.strip(" _"), False))
     for cut in (1, -3, -2, -1):  # the unit comes first, or last, also in some words, as deg C, m|A and m|A.h
         parts = ["".join(words[:cut]), "".join(words[cut:])]
         unit, base = parts if cut > 0 else parts[::-1]
-        if base in ranks and unit in known:
-            return base, unit
-    return whole, ""
+        if base and unit:
+            found.append((base, unit, True))
+    return tuple(found)
+
+
+def _stated_unit(name: str, quantity: str) -> str:
+    """The unit in a name that the caller gives, whatever the rest of it is."""
+    readings = _readings(name)
+    units = (readings[0][0], *(unit for _, unit, _ in readings if unit))
+    return next((unit for unit in units if _unit(unit, quantity)), "")
+
+
+def _words(name: str) -> list[str]:
+    return _GAP.sub(" ", name[:_LONGEST]).lower().split()
+
+
+def _key(name: str) -> str:
+    return "".join(_words(normalize("NFKC", name)))
 
 
 def _label(name: str | None, text: str | None) -> str:
     """A name with the unit that is written below it, unless it has one itself."""
     name, unit = name or "", (text or "").strip(_AROUND_UNITS)
+    has_none = not any(each and any(_unit(each, quantity) for quantity in _UNITS) for _, each, _ in _readings(name))
     is_unit = any(_unit(unit, quantity) for quantity in _UNITS)
-    is_plain = any("".join(_words(name)) in ranks for ranks in _RANKS.values())
-    has_none = is_plain or not any(_split(name, quantity)[1] for quantity in _UNITS)
-    return f"{name} ({unit})" if name and is_unit and has_none else name
+    is_plain = any(_key(name) in _ranks(tuple(names)) for names in TESTERS[-1].columns.values())
+    return f"{name} ({unit})" if name and is_unit and (has_none or is_plain) else name
 
 
 def _unit(text: str, quantity: str) -> str | None:
@@ -257,40 +270,6 @@ def _unit(text: str, quantity: str) -> str | None:
     return None
 
 
-def _may_be(quantity: str, name: str) -> bool:
-    """Whether a name is among those of a quantity, and its unit not among those of another."""
-    words, unit = _split(name, quantity)
-    if words not in _RANKS[quantity] or ((quantity, words) in _WITH_UNIT and _unit(unit, quantity) is None):
-        return False
-    return _unit(unit, quantity) is not None or not any(_unit(unit, other) for other in _UNITS)
-
-
-def _is_known(quantity: str, name: str) -> bool:
-    """Whether a name may be that of a quantity, and its unit, if any, is known."""
-    unit = _split(name, quantity)[1]
-    return _may_be(quantity, name) and (not unit or _unit(unit, quantity) is not None)
-
-
-def _places(quantity: str, names: Sequence[str], labels: Sequence[str], chosen: str | None, unit: str | None) -> list[int]:
-    """The columns that may be a quantity: of clocks all, as one may be finer, of others those of the first name."""
-    if chosen is not None:
-        places = [n for n, name in enumerate(names) if name == chosen.strip()]
-        if not places:
-            raise ValueError(f"there is no column {chosen!r} for the {quantity} among {', '.join(filter(None, names))}")
-        return places[:1]
-    split = {n: _split(name, quantity) for n, name in enumerate(labels) if name and _may_be(quantity, name)}
-    places = sorted(split, key=lambda n: _RANKS[quantity][split[n][0]])
-    known = [n for n in places if unit or not split[n][1] or quantity not in _UNITS or _unit(split[n][1], quantity)]
-    if places and not known and quantity not in REQUIRED:
-        name = names[places[0]]
-        warnings.warn(f"the unit of {name!r} is not known (--units {quantity}=UNIT). It is left out", stacklevel=2)
-        return []
-    places = known or places
-    if quantity in REQUIRED:
-        return [n for n in places if quantity == "time" or split[n][0] == split[places[0]][0]]
-    return places[:1]
-
-
 def _scale(quantity: str, unit: str, name: str) -> tuple[float, float, str]:
     if quantity not in _UNITS or not unit:
         return 1.0, 0.0, ""
@@ -301,3 +280,93 @@ def _scale(quantity: str, unit: str, name: str) -> tuple[float, float, str]:
             f"{', '.join(_UNITS[quantity])}. State it: --units {quantity}=UNIT (Python: units)"
         )
     return *_UNITS[quantity][known], known
+
+
+def are_units(fields: Sequence[str]) -> bool:
+    """Whether the line below a header holds units, where some testers write them; a clock may have none."""
+    texts = [text for field in fields if (text := field.strip(_AROUND_UNITS))]
+    return not any(map(_NUMBER.match, texts)) and all(
+        any(_unit(text, each) for each in (quantity, *INSTEAD.get(quantity, ())) for text in texts)
+        for quantity in ("voltage", "current")
+    )
+
+
+def count_required(names: Sequence[str], file_format: FileFormat) -> int:
+    """How much a line looks like the header of a record."""
+    names = [str(name) for name in names if any(map(str.isalpha, str(name)))]
+    testers, chosen = [file_format.tester or TESTERS[-1]], file_format.columns or {}
+    return sum(
+        (
+            any(name.strip() == chosen[quantity] for name in names)
+            if quantity in chosen
+            else any(has(each, names, testers[0]) for each in (quantity, *INSTEAD.get(quantity, ())))
+        )
+        for quantity in REQUIRED
+    )
+
+
+def has(quantity: str, names: Iterable[str], tester: Tester = TESTERS[-1]) -> bool:
+    """Whether one of the names is that of a quantity."""
+    ranks = _ranks(tuple(tester.columns.get(quantity, ())))
+    matches = (_match(name, quantity, ranks, tester.units) for name in names)
+    return any(match and (not match[1] or _unit(match[1], quantity)) for match in matches)
+
+
+def direction(state: object) -> int:
+    """1 for what a tester calls a discharge, -1 for a charge, else 0."""
+    words = " ".join(_words(str(state)))
+    return 1 if _DISCHARGE.search(words) else -1 if _CHARGE.search(words) else 0
+
+
+def _of_words(rows: Iterable[Sequence[str]]) -> list[int]:
+    """Columns of a few words."""
+    texts = [{text for value in values if (text := value.strip())} for values in zip(*rows, strict=False)]
+    return [n for n, words in enumerate(texts) if 0 < len(words) <= _FEW_WORDS and not any(map(_NUMBER.match, words))]
+
+
+def _unknown(names: Sequence[str], rows: Sequence[Sequence[str]], found: Recognised, source: str) -> str:
+    """What is said of a table that lacks what a record needs: its first lines, what is known, and what reads it."""
+    used = {column.position for column in found.columns.values()}
+    likely = {
+        quantity: [name for n, name in enumerate(names) if n not in used and _stated_unit(name, quantity)]
+        for quantity in found.missing
+    }
+    state = ",".join(f"{each}={likely[each][0] if len(likely[each]) == 1 else 'NAME'}" for each in found.missing)
+    known = ", ".join(f"{each} = {shown(column)}" for each, column in found.columns.items()) or "nothing"
+    lines = "; ".join(shortened(", ".join(row)) for row in rows[:2])
+    return (
+        f"no column for the {', the '.join(found.missing)} among {shortened(', '.join(map(str, names)))}. The first rows: "
+        f"{lines}. Recognised: {known}. Say which it is: --columns {state} (Python: columns), or fill in the file that "
+        f"battery-calibrate columns {source} writes"
+    )
+
+
+def description(names: Sequence[str], rows: Sequence[Sequence[str]], found: Recognised) -> str:
+    """What is recognised of a table, with its first lines."""
+    used = {column.position for column in found.columns.values()}
+    others = ", ".join(name for n, name in enumerate(names) if name and n not in used)
+    return "\n".join(
+        [
+            f"header      {shortened(', '.join(names))}",
+            *(f"row {n}       {shortened(', '.join(row))}" for n, row in enumerate(rows[:2], start=1)),
+            f"tester      {found.tester.name}",
+            *(f"{key:<12}{shown(column)}" for key, column in found.columns.items()),
+            *(f"{quantity:<12}not found" for quantity in found.missing),
+            f"not used    {shortened(others)}",
+        ]
+    )
+
+
+def shown(column: Column) -> str:
+    """A column for messages."""
+    return f"{shortened(column.name)!r}{f' in {column.unit}' if column.unit else ''}"
+
+
+def shortened(text: str) -> str:
+    """A line for messages."""
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+
+
+def say(text: str) -> None:
+    """Tell who reads a file what was done to it."""
+    warnings.warn(text, stacklevel=3)

@@ -1,7 +1,4 @@
-"""
-Recorded discharges from files and tables as testers write them: which columns, which unit, which sign, and which of the rows
-are a discharge.
-"""
+"""Recorded discharges from files and tables of testers: which of the rows are a discharge, and what is known beside it."""
 
 from __future__ import annotations
 
@@ -10,44 +7,37 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Collection, Mapping
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
 
-from battery_env.arrays import FloatArray
-from battery_env.lab.readers.columns import Column, FileFormat, unit_of
-from battery_env.lab.readers.rows import cells_of, mended
-from battery_env.lab.readers.tables import columns_of, read_columns
-from battery_env.records import LEAST_LOAD_SHARE, SWITCH_SHARE, ChargeBefore, ChargeHistory, drawn
-from battery_env.records.discharge import LEAST_SAMPLES, Discharge, read_nasa_mat
+from battery_env.arrays import BoolArray, FloatArray, IntArray
+from battery_env.checks import LOAD_LIMITS
+from battery_env.lab.readers.columns import FileFormat, Recognised, find_columns, say
+from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, cells_of, rows_of_cell
+from battery_env.lab.readers.signs import MUCH_SHARE, with_signed_current
+from battery_env.lab.readers.tables import check_mat, open_frame, read_columns
+from battery_env.lab.readers.testers import Tester, find_tester
+from battery_env.records import LEAST_LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE, ChargeBefore, ChargeHistory, drawn
+from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES, Discharge, read_nasa_mat
 
 Made = TypeVar("Made")
 
 # A stretch of charging ends a discharge if it returns more than this share of the charge drawn until then; less is braking.
+# What draws less than this share of the charge before and of the one after is a pulse within a charge.
 _RETURNED_SHARE = 0.2
 # A charge before the load is cut off if it exceeds this share of the charge drawn; a smaller one is sensor offset. A charge
 # within the load ends the discharge only if it returns more than this share of the largest charge drawn: early pulses return
 # much of the little drawn yet.
 _CHARGED_SHARE = 0.02
-# What returns less than this share of the charge that passes in all is not looked at.
-_NOTHING_SHARE = 1e-3
-# What draws less than this share of the largest discharge of its file is a pulse between two charges, and left aside; so is
-# what draws less than _RETURNED_SHARE of the charge before and of the charge after.
-_LEAST_SHARE = 0.01
-# Over longer gaps than this a temperature that is missing is a guess, s.
-_TEMPERATURE_GAP_S = 600.0
-# What the tester counted may be off by this share, as of rows a minute apart.
-_COUNTED_SHARE = 0.01
-# Where the voltage comes back so near to that of the start, as a share of its fall, the cell was charged; so little of the
-# fall of the whole record is a pulse.
-_BACK_SHARE = 0.25
-# What errors advise.
-_SENTENCE = re.compile(r"(?<=[^.\s]\.)\s+(?=[A-Z])")
-_UNIT_ADVICE = re.compile(r" in [^,]+, not in \w+ \(command line: --units (\w+)=(\w+)\)(, and)?")
-_CLOCK_ADVICE, _SIGN_ADVICE = "Give the time in seconds: ", ": flip the sign"
+# What errors advise about a unit, a clock, a step and the sign, which helps only where these are not known.
+_UNIT_ADVICE = r" in [^,:]+, not in \w+ \(command line: --units {0}=\w+\)(, and)?"
+_CLOCK_ADVICE = re.compile(r" Give the time in seconds: .*--units time=\w+\)\.")
 _STEP_ADVICE = re.compile(r", or name the column of its step|, and one that does with each step a column of the step")
+_SIGN_ADVICE = re.compile(r": flip the sign.*")
 
 
 class Recording(NamedTuple):
@@ -59,34 +49,18 @@ class Recording(NamedTuple):
     stated: frozenset[str] = frozenset()
 
     def discharge(self) -> Discharge:
-        """Check it; what an error advises is left out where it contradicts what is known, or would not help."""
+        """Check it; what an error advises is left out where it is known to be otherwise."""
         if (count := len(self.arrays["time_s"])) < LEAST_SAMPLES:
             raise ValueError(f"{count} rows are no discharge. If each is the end of a step, export all that was recorded.")
         try:
             return Discharge(**self.arrays, meta=self.meta)
         except ValueError as error:
-            raise ValueError(" ".join(filter(None, map(self._helpful, _SENTENCE.split(str(error)))))) from error
-
-    def _helpful(self, sentence: str) -> str:
-        """What is left of a sentence of an error once the option that it advises, if any, was tried."""
-        if "step" in self.stated:
-            sentence = _STEP_ADVICE.sub("", sentence)
-        if "time" in self.stated and sentence.startswith(_CLOCK_ADVICE):
-            return ""
-        unit = _UNIT_ADVICE.search(sentence)
-        if not unit and _SIGN_ADVICE not in sentence:
-            return sentence
-        quantity, (factor, offset) = (unit[1], unit_of(unit[1], unit[2])) if unit else ("current", (-1.0, 0.0))
-        if (quantity if unit else "sign") not in self.stated:
-            name = next(each for each in self.arrays if each.startswith(quantity))
-            try:
-                Discharge(**self.arrays | {name: factor * self.arrays[name] + offset})
-                return sentence
-            except ValueError:
-                pass
-        if unit:
-            return _UNIT_ADVICE.sub(",", sentence) if unit[3] else ""
-        return sentence.partition(_SIGN_ADVICE)[0] + "."
+            text = str(error)
+            for quantity in self.stated:
+                text = re.sub(_UNIT_ADVICE.format(quantity), lambda found: "," if found[1] else "", text)
+            for name, advice in (("time", _CLOCK_ADVICE), ("step", _STEP_ADVICE)):
+                text = advice.sub("", text) if name in self.stated else text
+            raise ValueError(_SIGN_ADVICE.sub(".", text) if "sign" in self.stated else text) from error
 
 
 def read_discharges(
@@ -95,6 +69,7 @@ def read_discharges(
     units: Mapping[str, str] | None = None,
     discharge_is_negative: bool | None = None,
     ignore: Collection[str] = (),
+    tester: str | Path | Tester | None = None,
 ) -> list[Discharge]:
     """
     Read the discharges of a file or of a table.
@@ -107,8 +82,8 @@ def read_discharges(
     It may hold charges and rests as well, many cycles, and several cells if a column names them. A discharge is what lies
     between two charges, with the rest before the load; it is numbered by the cycle that is given, or else counted. If there
     are several, each has its own clock, which starts at its first sample. Discharges whose charges are not logged are told
-    apart by the column of the cycle, or a clock that starts anew at rest, alone. What is mended is said in a warning. A
-    temperature that is missing in some rows is interpolated.
+    apart by the column of the cycle alone. What is mended is said in a warning. A temperature that is missing in some rows is
+    interpolated.
 
     .. code-block:: python
 
@@ -123,12 +98,15 @@ def read_discharges(
     :param discharge_is_negative: how the current of a discharge is counted; ``None``: told from the voltage, which jumps
         against a load where that is switched, or from words for charge and discharge
     :param ignore: names of columns that are not looked at
+    :param tester: whose table it is: a name of the testers' table, or a file in TOML that adds one; ``None``: told from it
     :return: the discharges; their ``meta`` holds ``source`` and, if there are several or they are numbered, ``cycle``. One
         that fails the checks of :class:`~battery_env.Discharge` is left out with a warning
     :raises ValueError: if there is none, the file is damaged, or it does not tell what is asked for
     :raises ImportError: if the file needs an extra that is not installed
     """
-    return each_usable(lambda discharge: discharge, source, FileFormat(columns, units, discharge_is_negative, ignore))
+    known = None if tester is None else find_tester(tester)
+    file_format = FileFormat(columns, units, discharge_is_negative, ignore, known)
+    return each_usable(lambda discharge: discharge, source, file_format)
 
 
 def each_usable(use: Callable[[Discharge], Made], source: str | Path | pd.DataFrame, file_format: FileFormat) -> list[Made]:
@@ -170,15 +148,18 @@ def read_recordings(source: str | Path | pd.DataFrame, file_format: FileFormat) 
     name = _name_of(source)
     try:
         if isinstance(source, pd.DataFrame):
-            recordings = _recordings(name, *columns_of(source, file_format), file_format)
+            opened = open_frame(source)
+            known = find_columns(opened.names, file_format, opened.rows, name)
+            recordings = _recordings(name, opened.read(known), known, file_format)
         elif Path(source).suffix.lower() == ".mat":
+            check_mat(Path(source))
             recordings = [Recording(arrays, meta) for arrays, meta in read_nasa_mat(Path(source))]
         else:
             recordings = _recordings(name, *read_columns(Path(source), file_format), file_format)
         if not recordings:
             raise ValueError("there is no discharge")
     except (TypeError, ValueError) as error:
-        raise ValueError(str(error) if name in str(error) else f"{name}: {error}") from error
+        raise ValueError(str(error) if str(error).startswith(name) else f"{name}: {error}") from error
     return recordings
 
 
@@ -188,14 +169,17 @@ def _name_of(source: str | Path | pd.DataFrame) -> str:
     return "DataFrame" if isinstance(source, pd.DataFrame) else str(source)
 
 
-def _recordings(source: str, table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> list[Recording]:
-    stated = frozenset(quantity for quantity, column in columns.items() if column.unit or quantity == "step")
+def _recordings(source: str, table: pd.DataFrame, known: Recognised, file_format: FileFormat) -> list[Recording]:
+    stated = frozenset(quantity for quantity, column in known.columns.items() if column.unit or quantity == "step")
     stated |= {"sign"} if file_format.discharge_is_negative is None else set()
     found, reasons = [], []
-    for cell, rows in cells_of(table, columns).items():
+    for cell, rows in cells_of(table).items():
         meta = {"source": source} | ({"cell": cell} if cell else {})
         try:
-            found += _split(mended(rows, columns, file_format), meta, stated)
+            rows = rows_of_cell(rows, known.columns, file_format)
+            if not file_format.load:  # which is what it says
+                rows = with_signed_current(rows, known, file_format.discharge_is_negative)
+            found += _split(rows, meta, stated)
         except ValueError as error:
             reasons.append(f"cell {cell}: {error}" if cell else str(error))
     if not found:
@@ -206,60 +190,97 @@ def _recordings(source: str, table: pd.DataFrame, columns: Mapping[str, Column],
 
 
 def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> list[Recording]:
-    """The discharges among the rows of one cell."""
+    """The discharges among the rows of one cell; what is left aside is named."""
     bounds = _bounds(rows)
     parts = [part for low, high in itertools.pairwise(bounds) for part in _discharges(rows, low, high)]
     if not parts:
         raise ValueError("there is no discharge: no charge is drawn. Check the sign of the current")
-    least_C = _LEAST_SHARE * max(drawn_C for _, drawn_C in parts)
-    passed_C = _passed_C(rows["time"].to_numpy(), rows["current"].to_numpy())
-    ends_C = [passed_C[[stretch.start, stretch.stop - 1]] for stretch, _ in parts]
+    current_A = rows["current"].to_numpy()
+    # what no cell can draw is refused later, and is no measure of the others
+    of_cells_C = [drawn_C for part, drawn_C in parts if current_A[part].max() <= LOAD_LIMITS["current"]]
+    least_C = FEW_SHARE * max(of_cells_C, default=0.0)
+    passed_C = _passed_C(rows["time"].to_numpy(), current_A)
+    ends_C = [passed_C[[part.start, part.stop - 1]] for part, _ in parts]
     charged_C = -np.diff(np.concatenate([[0.0], *ends_C, passed_C[-1:]]))[::2]
     pulses_C = _RETURNED_SHARE * np.minimum(charged_C[:-1], charged_C[1:])
-    stretches = [part for (part, drawn_C), each_C in zip(parts, pulses_C, strict=True) if drawn_C >= max(each_C, least_C)]
+    drawn_C = np.array([each_C for _, each_C in parts])
+    is_small, is_pulse = drawn_C < least_C, drawn_C < pulses_C
+    _say_left_aside(rows, parts, is_small, f"as they draw less than {FEW_SHARE:.0%} of the largest")
+    _say_left_aside(rows, parts, is_pulse & ~is_small, "as they are pulses within charges")
+    stretches = [part for (part, _), small, pulse in zip(parts, is_small, is_pulse, strict=True) if not (small or pulse)]
     if not stretches:
         raise ValueError("there is no discharge: what is drawn are pulses within charges. Check the sign of the current")
-    if pulses := sum(least_C <= drawn_C < each_C for (_, drawn_C), each_C in zip(parts, pulses_C, strict=True)):
-        warnings.warn(f"pulses within charges, which are no discharges, are left aside: {pulses}", stacklevel=2)
-    before = [ChargeHistory(charge=_charge_before(rows, each.start), load_on_s=_load_on_s(rows, each)) for each in stretches]
-    return [
-        _recording(
-            rows[stretch], history, meta | ({"cycle": number} if len(stretches) > 1 else {}), len(stretches) > 1, stated
+    not_charging = np.maximum.accumulate(np.where(current_A >= 0.0, np.arange(len(rows)), -1))
+    several = len(stretches) > 1
+    found = []
+    for number, stretch in enumerate(stretches, start=1):
+        history = ChargeHistory(charge=_charge_before(rows, not_charging, stretch.start), load_on_s=_load_on_s(rows, stretch))
+        numbered = meta | ({"cycle": number} if several else {})
+        found.append(_recording(rows.iloc[stretch], history, numbered, several, stated))
+    return found
+
+
+def _say_left_aside(rows: pd.DataFrame, parts: list[tuple[slice, float]], which: BoolArray, why: str) -> None:
+    """Name what is no discharge; what draws next to nothing is noise of a sensor."""
+    most_C = max(drawn_C for _, drawn_C in parts)
+    named = [part for part, each in zip(parts, which, strict=True) if each and part[1] > NOTHING_SHARE**2 * most_C]
+    if named:
+        first = "; ".join(
+            f"{drawn_C / 3600.0:.3g} Ah in rows {rows.index[part.start] + 1} to {rows.index[part.stop - 1] + 1}"
+            for part, drawn_C in named[:3]
         )
-        for number, (stretch, history) in enumerate(zip(stretches, before, strict=True), start=1)
-    ]
+        say(f"left aside, {why}: {len(named)} ({first}{' and others' if len(named) > 3 else ''})")
 
 
 def _bounds(rows: pd.DataFrame) -> list[int]:
     """
-    Where a test begins, or the number of the cycle changes, but not where that parts a rest from its load, or a discharge
-    whose voltage goes on: counters may count loops, or go up where the load is switched on.
+    Where the number of the cycle changes, but not where that parts a rest from its load, or a discharge whose voltage goes on:
+    counters may count loops, or go up where the load is switched on.
     """
-    bounds = [0]
-    if {"cycle", "test"} & set(rows):
-        time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
-        switch_A, lowest_V = SWITCH_SHARE * np.abs(current_A).max(), voltage_V.min()
-        charged = np.zeros(len(rows), dtype=np.bool_)
-        for start, end, _, is_braking in _charges(current_A, _passed_C(time_s, current_A)):
-            charged[start:end] = not is_braking and current_A[start:end].min() < -switch_A
-        charges, under_load = np.flatnonzero(charged), np.flatnonzero(charged | (current_A > switch_A))
-        counters = rows[[each for each in ("cycle", "test") if each in rows]]
-        changes = (np.flatnonzero(np.diff(counters, axis=0).any(axis=1)) + 1).tolist()
-        for n, following in itertools.pairwise([*changes, len(rows)]):
-            k = int(np.searchsorted(under_load, n))
-            before, after = (int(each[0]) if len(each) else None for each in (under_load[:k][-1:], under_load[k : k + 1]))
-            if time_s[n] < time_s[n - 1] or (after is not None and charged[after]):
+    if "cycle" not in rows:
+        return [0, len(rows)]
+    time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
+    # a cycle may draw little beside others
+    most_A = rows["current"].abs().groupby(rows["cycle"]).transform("max").to_numpy()
+    switch_A = SWITCH_SHARE * np.maximum(most_A, min(REST_CURRENT_A / SWITCH_SHARE, most_A.max()))
+    lowest_V = voltage_V.min()
+    charged = np.zeros(len(rows), dtype=np.bool_)
+    for start, end, _, is_braking in _charges(current_A, _passed_C(time_s, current_A)):
+        charged[start:end] = not is_braking and (current_A[start:end] < -switch_A[start:end]).any()
+    n = np.arange(len(rows))
+    loads = charged | (current_A > switch_A)
+    # of each row the last one under load or charge before it, the next one from it on, and the last one of a charge
+    before = np.maximum.accumulate(np.append(-1, np.where(loads, n, -1)[:-1]))
+    after = np.minimum.accumulate(np.where(loads, n, len(rows))[::-1])[::-1]
+    last_charge = np.maximum.accumulate(np.where(charged, n, -1))
+    bounds, since = [0], _Range(voltage_V)
+    changes = (np.flatnonzero(np.diff(rows["cycle"])) + 1).tolist()
+    for n, following in itertools.pairwise([*changes, len(rows)]):
+        if time_s[n] < time_s[n - 1] or (after[n] < len(rows) and charged[after[n]]):
+            bounds.append(n)
+        elif after[n] < len(rows) and (before[n] < 0 or charged[before[n]]):
+            # a rest that is all in the cycle before belongs to the load
+            bounds.append(n if after[n] > n else int(before[n]) + 1)
+        elif after[n] < len(rows):
+            low_V, top_V = since.of(max(bounds[-1], int(last_charge[n]) + 1), n)
+            is_back = top_V - voltage_V[n : min(after[n] + 1, following)].max() < MUCH_SHARE * (top_V - low_V)
+            if is_back and top_V - low_V > MUCH_SHARE * (top_V - lowest_V):
                 bounds.append(n)
-            elif after is not None and (before is None or charged[before]):
-                # a rest that is all in the cycle before belongs to the load
-                bounds.append(n if after > n else 0 if before is None else before + 1)
-            elif after is not None:
-                low = max(bounds[-1], *(charges[: np.searchsorted(charges, n)][-1:] + 1), 0)
-                top_V, low_V = voltage_V[low:n].max(), voltage_V[low:n].min()
-                is_back = top_V - voltage_V[n : min(after + 1, following)].max() < _BACK_SHARE * (top_V - low_V)
-                if is_back and top_V - low_V > _BACK_SHARE * (top_V - lowest_V):
-                    bounds.append(n)
     return [*sorted({*bounds}), len(rows)]
+
+
+class _Range:
+    """The lowest and the highest of values from one row to another, of rows that only go on: each is looked at once."""
+
+    def __init__(self, values: FloatArray) -> None:
+        self.values, self.low, self.high, self.found = values, -1, -1, (0.0, 0.0)
+
+    def of(self, low: int, high: int) -> tuple[float, float]:
+        part = self.values[low:high] if low != self.low else self.values[self.high : high]
+        least, most = float(part.min(initial=np.inf)), float(part.max(initial=-np.inf))
+        self.found = (least, most) if low != self.low else (min(least, self.found[0]), max(most, self.found[1]))
+        self.low, self.high = low, high
+        return self.found
 
 
 def _passed_C(time_s: FloatArray, current_A: FloatArray) -> FloatArray:
@@ -276,12 +297,14 @@ def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[tuple[slice, fl
     found = list(itertools.pairwise([0, *(start for start, _, is_end, _ in charges if is_end), high - low]))
     parts = []
     for begin, end in found:
+        own = list(itertools.takewhile(lambda each, end=end: each[0] < end, charges))  # type: ignore[misc]
+        charges = charges[len(own) :]
         peak_A = current_A[begin:end].max()
         if not peak_A > 0.0:
             continue
         first = begin + int(np.argmax(current_A[begin:end] > SWITCH_SHARE * peak_A))
         drawn_C = float(passed_C[first:end].max() - passed_C[first])
-        for start, stop, _, is_braking in charges:
+        for start, stop, _, is_braking in own:
             is_before = begin <= start and stop <= (first if is_braking else end)
             if is_before and passed_C[start] - passed_C[stop - 1] > _CHARGED_SHARE * drawn_C:
                 begin = stop
@@ -290,15 +313,13 @@ def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[tuple[slice, fl
     return parts
 
 
-def _charge_before(rows: pd.DataFrame, begin: int) -> ChargeBefore | None:
+def _charge_before(rows: pd.DataFrame, not_charging: IntArray, begin: int) -> ChargeBefore | None:
     """The charge that ends where a discharge begins, if it is in the table and no mere noise."""
-    current_A = rows["current"].to_numpy()
-    start = int(np.append(-1, np.flatnonzero(current_A[:begin] >= 0.0))[-1]) + 1
-    charging_A = current_A[start:begin]
-    if not (charging_A < -LEAST_LOAD_SHARE * np.abs(current_A).max()).any():
+    start = int(not_charging[begin - 1]) + 1 if begin else 0
+    time_s, voltage_V, current_A = (rows[each].to_numpy()[start:begin] for each in ("time", "voltage", "current"))
+    if not (current_A < -LEAST_LOAD_SHARE * np.abs(rows["current"].to_numpy()).max()).any():
         return None
-    time_s, voltage_V = (rows[each].to_numpy()[start:begin] for each in ("time", "voltage"))
-    return ChargeBefore.of(time_s, voltage_V, charging_A)
+    return ChargeBefore.of(time_s, voltage_V, current_A)
 
 
 def _load_on_s(rows: pd.DataFrame, stretch: slice) -> float | None:
@@ -335,6 +356,10 @@ def _recording(
         history = history._replace(load_on_s=history.load_on_s - float(time_s[0]))
     if "cycle" in rows:
         meta["cycle"] = int(rows["cycle"].iloc[int(np.argmax(current_A > SWITCH_SHARE * current_A.max()))])
+    # dates of this century are more than a billion seconds after 1970, and a clock is none
+    if "date" in rows and rows["date"].iloc[0] > 1e9:
+        begin = datetime.fromtimestamp(float(rows["date"].iloc[0]), tz=timezone.utc)
+        meta["start_time"] = begin.replace(tzinfo=None).isoformat(timespec="milliseconds")
     if "ambient" in rows and not rows["ambient"].isna().all():
         meta["ambient_temperature_C"] = float(rows["ambient"].median())
     arrays = {
@@ -346,11 +371,11 @@ def _recording(
         temperature_C = _filled(time_s, rows["temperature"].to_numpy())
         if temperature_C is not None:
             arrays["temperature_C"] = temperature_C
-    arrays["history"] = _with_count(history, rows)
+    arrays["history"] = _with_count(history, rows, stated)
     return Recording(arrays, meta, stated)
 
 
-def _with_count(history: ChargeHistory, rows: pd.DataFrame) -> ChargeHistory:
+def _with_count(history: ChargeHistory, rows: pd.DataFrame, stated: frozenset[str]) -> ChargeHistory:
     """With how much the charge under load is another one than the tester counted row by row, or than a clock lost."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
@@ -373,12 +398,13 @@ def _with_count(history: ChargeHistory, rows: pd.DataFrame) -> ChargeHistory:
     # some count what is drawn alone, others what is returned, too
     passed_C = [drawn(time_s[part], each[part], time_s[part]) for each in (np.maximum(current_A, 0.0), np.abs(current_A))]
     off_C = min((float(np.diff(each)[goes_on].sum()) - counted_C for each in passed_C), key=abs)
-    if abs(off_C) > _COUNTED_SHARE * counted_C:
-        warnings.warn(
-            f"the tester counted {counted_C / 3600.0:.4g} Ah, where current and time make {(counted_C + off_C) / 3600.0:.4g} "
-            "Ah: check units and clock, and that all rows are there",
-            stacklevel=2,
-        )
+    if abs(off_C) > FEW_SHARE * counted_C:
+        counted_Ah, passed_Ah = counted_C / 3600.0, (counted_C + off_C) / 3600.0
+        told = f"the tester counted {counted_Ah:.4g} Ah, where current and time make {passed_Ah:.4g} Ah"
+        for unit, (symbol, tick_s) in CLOCKS.items() if "time" not in stated else ():
+            if tick_s != 1.0 and abs(counted_Ah / passed_Ah - tick_s) <= SWITCH_SHARE * tick_s:
+                raise ValueError(f"{told}, as if the clock counts {unit}: --units time={symbol}")
+        say(f"{told}: check units and clock, and that all rows are there")
     return history._replace(is_counted=is_counted, uncounted_C=abs(off_C))
 
 
@@ -389,7 +415,7 @@ def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int
     """
     charging = np.concatenate([[False], current_A < 0.0, [False]])
     starts, ends = np.flatnonzero(~charging[:-1] & charging[1:]), np.flatnonzero(charging[:-1] & ~charging[1:])
-    counts = passed_C[starts] - passed_C[ends - 1] > _NOTHING_SHARE * float(np.ptp(passed_C))
+    counts = passed_C[starts] - passed_C[ends - 1] > NOTHING_SHARE * float(np.ptp(passed_C))
     least_C = _CHARGED_SHARE * float((passed_C - np.minimum.accumulate(passed_C)).max())
     found, lowest_C, highest_C = [], passed_C[0], passed_C[0]
     for start, end in zip(starts[counts].tolist(), ends[counts].tolist(), strict=True):
@@ -412,6 +438,6 @@ def _filled(time_s: FloatArray, temperature_C: FloatArray) -> FloatArray | None:
     if not known.any():
         return None
     gap_s = float(np.diff([time_s[0], *time_s[known], time_s[-1]]).max())
-    if gap_s > _TEMPERATURE_GAP_S:
+    if gap_s > SWITCH_SHARE * np.ptp(time_s):
         warnings.warn(f"the temperature is missing for up to {gap_s:.0f} s, and interpolated", stacklevel=2)
     return np.interp(time_s, time_s[known], temperature_C[known])

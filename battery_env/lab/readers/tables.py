@@ -8,12 +8,13 @@ import gzip
 import io
 import itertools
 import lzma
-import operator
 import re
 import warnings
 import zipfile
+import zlib
 from codecs import getincrementaldecoder
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
@@ -21,8 +22,9 @@ from typing import IO, Any, NamedTuple, cast
 import numpy as np
 import pandas as pd
 
-from battery_env.files import check_unpacked
-from battery_env.lab.readers.columns import REQUIRED, Column, FileFormat, are_units, count_required, find_columns, has
+from battery_env.files import LARGEST_UNPACKED_BYTES
+from battery_env.lab.readers.columns import FileFormat, Recognised, are_units, count_required, find_columns, has, say
+from battery_env.lab.readers.testers import ENCODINGS, REQUIRED
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
 #: Text of Maccor's is numbered.
@@ -32,29 +34,27 @@ BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr", ".xlsx", ".xls")
 PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zip")
 
 _OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
-# Testers write what they know about a test above the table: so many bytes are searched for its header.
-_HEAD_BYTES = 1 << 18
+# Testers write what they know about a test above the table: its header is searched in so many bytes and lines. A table is
+# known by so many of its rows.
+_HEAD_BYTES, _HEAD_LINES, _FIRST_ROWS = 1 << 18, 2000, 400
+# A small file has no more rows and columns, so that all that is made of it fits into 1 GB; a large one a row each 20 bytes.
+_MOST_ROWS, _LEAST_ROW_BYTES, _MOST_COLUMNS = 3_000_000, 20, 2000
 _BLANKS = r"\s+"
 _DELIMITERS = (",", ";", "\t", "|", _BLANKS)
 _ITS_COMMA = re.compile(r"^(\s*[-+]?\d*),(?=\d)")
 _DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
-_NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
-_DATE, _CLOCK = re.compile(r"\d+([-./])\d+\1\d+$"), re.compile(r"\d+:\d\d")
 _DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
+_NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
 # What Excel reads in the first line of a file: the delimiter.
 _DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
 # Some testers put lines as a whole in quotes.
 _QUOTED_LINES = re.compile(rb'^"([^"\n]*)"\s*$', flags=re.MULTILINE)
-# What is packed is read in parts of so many bytes, or rows.
-_CHUNK_BYTES, _BATCH_ROWS = 1 << 20, 1 << 16
-# A table is known by so many of its first rows.
-_FIRST_ROWS = 400
 # How workbooks begin; text is called .xls by some testers.
 _WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 _EXPORT = {".res": "export the channel as CSV in MITS Pro", ".h5": "export the records as CSV"}
 
 
-class _Layout(NamedTuple):
+class Layout(NamedTuple):
     """How a text file is laid out."""
 
     encoding: str
@@ -64,39 +64,47 @@ class _Layout(NamedTuple):
     names: list[str]
     layers: int  # so many columns at the left number what lies above a row, as its cycle and its step
     rows: list[list[str]]  # fields of the first lines below the header
-    clock: int | None  # the column that goes on a date in the one before
 
 
-def read_columns(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
+class Opened(NamedTuple):
+    """A table of which the header and the first rows are read."""
+
+    names: list[str]
+    rows: list[list[str]]
+    read: Callable[[Recognised], pd.DataFrame]  # the columns of a record, by quantity, and no others
+
+
+def read_columns(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, Recognised]:
     """Read the columns of a record, and no others."""
+    opened = open_file(path, file_format)
+    found = find_columns(opened.names, file_format, opened.rows, str(path))
+    return opened.read(found), found
+
+
+def open_file(path: Path, file_format: FileFormat) -> Opened:
+    """Read the beginning of a file."""
     suffix = path.suffix.lower()
     if suffix in _EXPORT:
         raise ValueError(f"{suffix} files cannot be read: {_EXPORT[suffix]}")
     if suffix in (".ndax", ".xlsx", ".xls"):
         _check_archive(path)
     if suffix == ".parquet":
-        return _read_parquet(path, file_format)
-    if suffix in (".nda", ".ndax"):
-        return columns_of(_read_neware(path), file_format)
-    if suffix == ".mpr":
-        return columns_of(_read_biologic(path), file_format)
-    head = _content(path, _HEAD_BYTES)
-    if suffix in (".xlsx", ".xls") and head.startswith(_WORKBOOKS):
-        return _read_text(_sheet(path, file_format), file_format)
-    is_odd = b"\n" not in head or _QUOTED_LINES.search(head)
-    if not is_odd and suffix not in PACKED_SUFFIXES:
-        return _read_text(path, file_format)
-    content = _content(path)
-    if is_odd:  # lines may end as on old computers, too
-        content = _QUOTED_LINES.sub(rb"\1", content if b"\n" in head else content.replace(b"\r", b"\n"))
-    return _read_text(content, file_format)
+        return _open_parquet(path)
+    if suffix in (".nda", ".ndax", ".mpr"):
+        return open_frame(_read_biologic(path) if suffix == ".mpr" else _read_neware(path))
+    content = _text_of(path, file_format)
+    layout = _layout_of(content[:_HEAD_BYTES], file_format)
+    return Opened(layout.names, layout.rows, lambda found: _read_text(content, layout, found))
 
 
-def columns_of(table: pd.DataFrame, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
-    """The columns of a record, of a table; an index with a name is a column too."""
+def open_frame(table: pd.DataFrame) -> Opened:
+    """A table that is there; an index with a name is a column too."""
     table = table.reset_index(drop=table.index.names == [None])
-    columns = find_columns([str(name) for name in table.columns], file_format, _first_rows(table))
-    return pd.DataFrame({quantity: table.iloc[:, column.position] for quantity, column in columns.items()}), columns
+
+    def read(found: Recognised) -> pd.DataFrame:
+        return pd.DataFrame({key: table.iloc[:, column.position] for key, column in found.columns.items()})
+
+    return Opened([str(name) for name in table.columns], _first_rows(table), read)
 
 
 def _first_rows(table: pd.DataFrame) -> list[list[str]]:
@@ -104,87 +112,90 @@ def _first_rows(table: pd.DataFrame) -> list[list[str]]:
     return [[str(value) for value in row] for row in first.where(first.notna(), "").to_numpy()]
 
 
-def _read_text(source: Path | bytes, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
-    layout = _layout(source[:_HEAD_BYTES] if isinstance(source, bytes) else _content(source, _HEAD_BYTES), file_format.columns)
-    columns, header_lines = find_columns(layout.names, file_format, layout.rows), layout.header_line + 1
-    header_lines += bool(layout.rows) and are_units(layout.rows[0])
-    # one column may serve as two quantities
-    positions = sorted({*range(layout.layers), *filter(None, [layout.clock]), *(each.position for each in columns.values())})
+def _text_of(path: Path, file_format: FileFormat) -> bytes:
+    """The content of a text file, unpacked, or of a workbook as text, without what is no character."""
+    content = _content(path)
+    if path.suffix.lower() in (".xlsx", ".xls") and content.startswith(_WORKBOOKS):
+        return _sheet(path, file_format)
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        content = content.decode("utf-16", errors="ignore").encode()
+    kept = content.rstrip(b"\0")  # what a power cut leaves of the end
+    if 10 * kept.count(b"\0") > len(kept):
+        raise ValueError("the file is binary, and its ending is none of those that can be read")
+    kept = kept.replace(b"\0", b"")
+    if len(kept) < len(content):
+        say(f"{len(content) - len(kept)} NUL bytes, which are no text, are left out")
+    head = kept[:_HEAD_BYTES]
+    if b"\n" not in head:  # lines may end as on old computers, too
+        kept = kept.replace(b"\r", b"\n")
+    if _QUOTED_LINES.search(head):
+        kept = _QUOTED_LINES.sub(rb"\1", kept)
+    _check_rows(kept.count(b"\n"), len(kept))  # those of old computers, too
+    return kept.replace("\u2212".encode(), b"-")  # the sign of typographers
 
-    def read() -> pd.DataFrame:
-        try:
-            found = pd.read_csv(
-                io.BytesIO(source) if isinstance(source, bytes) else source,
+
+def _check_rows(count: int, size: int) -> None:
+    if count > max(_MOST_ROWS, size // _LEAST_ROW_BYTES):
+        raise ValueError(
+            f"{count} rows are more than the {_MOST_ROWS} that are read of a file of {size} bytes: cut it in parts"
+        )
+
+
+def _check_unpacked(count: int) -> None:
+    if count > LARGEST_UNPACKED_BYTES:
+        raise ValueError(f"unpacked it has more than the {LARGEST_UNPACKED_BYTES >> 20} MiB that are read: unpack it by hand")
+
+
+def _read_text(content: bytes, layout: Layout, found: Recognised) -> pd.DataFrame:
+    _check_width(layout)
+    header_lines = layout.header_line + 1 + (bool(layout.rows) and are_units(layout.rows[0]))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of columns that are text in parts, which is seen later
+            table = pd.read_csv(
+                io.BytesIO(content),
                 sep=layout.delimiter,
                 decimal=layout.decimal,
                 encoding=layout.encoding,
                 header=None,
                 names=range(len(layout.names)) if layout.layers else None,
                 skiprows=header_lines,
-                usecols=positions,
+                # one column may serve as two quantities
+                usecols=sorted({*range(layout.layers), *(each.position for each in found.columns.values())}),
                 index_col=False,
-                low_memory=False,
+                na_values=[*found.tester.missing],
             )
-        except pd.errors.EmptyDataError as error:
-            raise ValueError("there are no rows below the header") from error
-        except Exception as error:  # pandas raises whatever the damage leads it to
+    except pd.errors.EmptyDataError as error:
+        raise ValueError("there are no rows below the header") from error
+    except Exception as error:  # pandas raises whatever the damage leads it to
+        kept, _, last = content.rstrip().rpartition(b"\n")
+        if "EOF inside string" not in str(error) or last.count(b'"') % 2 == 0:
             raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
-        # words among numbers make text of all, as do signs of typographers
-        for column in {columns[quantity].position for quantity in ("voltage", "current") if quantity in columns}:
-            found[column] = found[column].replace("\u2212", "-", regex=True)
-        return found if layout.decimal == "." else found.replace(_ITS_COMMA, r"\1.", regex=True)
-
-    try:
-        table = read()
-    except ValueError as error:
-        if "EOF inside string" not in str(error):
-            raise
-        content = source if isinstance(source, bytes) else _content(source)
-        kept, _, last = content.decode(layout.encoding, errors="ignore").rstrip().rpartition("\n")
-        if last.count('"') % 2 == 0:
-            raise
-        warnings.warn("the last line is cut within quotes, and left out", stacklevel=2)
-        return _read_text(kept.encode(layout.encoding), file_format)
+        say("the last line is cut within quotes, and left out")
+        return _read_text(kept, layout, found)
+    if layout.decimal == ",":  # words among numbers make text of all
+        table = table.replace(_ITS_COMMA, r"\1.", regex=True)
     table = _lowest_layer(table, layout.layers)
-    if layout.clock and layout.clock - 1 in table:
-        date, clock = (table[place].astype("string") for place in (layout.clock - 1, layout.clock))
-        table[layout.clock - 1] = date.str.cat(clock, sep=" ").astype(object)
-    return pd.DataFrame({quantity: table[column.position] for quantity, column in columns.items()}), columns
+    return pd.DataFrame({key: table[column.position] for key, column in found.columns.items()})
 
 
-def _content(path: Path, most_bytes: int | None = None) -> bytes:
-    """The content of a file, or its beginning, unpacked; refused where it becomes far larger than it was."""
-    parts, count = [], 0
+def _content(path: Path) -> bytes:
+    """The content of a file, unpacked."""
+    parts, count, lines = [], 0, 0
     try:
         with _open(path) as stream:
-            while part := stream.read(most_bytes or _CHUNK_BYTES):
+            while part := stream.read(1 << 20):
                 parts.append(part)
                 count += len(part)
-                if most_bytes:
-                    break
-                check_unpacked(path.stat().st_size, count)
+                lines += part.count(b"\n")
+                _check_rows(lines, count)
+                if path.suffix.lower() in PACKED_SUFFIXES:
+                    _check_unpacked(count)
     except (FileNotFoundError, IsADirectoryError, PermissionError):
         raise
     except Exception as error:  # the unpackers raise whatever the damage leads them to
         raise ValueError(f"the file is damaged: {str(error).strip() or type(error).__name__}") from error
     return b"".join(parts)
-
-
-def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
-    """The rows of which no layer above has a number, each with the numbers that were given last."""
-    if not layers:
-        return table
-    numbers = list(range(layers))
-    above = table[numbers].notna().any(axis=1)
-    table[numbers] = table[numbers].ffill()
-    return table[~above]
-
-
-def _check_archive(path: Path) -> None:
-    """Refuse a file that holds an archive of what is far larger."""
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            check_unpacked(path.stat().st_size, sum(each.file_size for each in archive.infolist()))
 
 
 def _open(path: Path) -> IO[bytes]:
@@ -198,52 +209,101 @@ def _open(path: Path) -> IO[bytes]:
     return cast(IO[bytes], _OPENERS.get(suffix, open)(path, "rb"))
 
 
-def _layout(head: bytes, chosen: Mapping[str, str] | None) -> _Layout:
-    encoding, text = _decoded(head)
+def _check_archive(path: Path) -> None:
+    """Refuse a file that holds an archive of what is far larger, by what the archive says of itself."""
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            for each in archive.infolist():
+                # of a text that many cells share each is kept
+                _check_unpacked(each.file_size * (8 if each.filename.endswith("sharedStrings.xml") else 1))
+            _check_unpacked(sum(each.file_size for each in archive.infolist()))
+
+
+def check_mat(path: Path) -> None:
+    """Refuse a MATLAB file whose packed variables become far larger, before they are read."""
+    count = 0
+    with path.open("rb") as stream:
+        stream.seek(128)
+        while len(tag := stream.read(8)) == 8:
+            kind, size = np.frombuffer(tag, dtype="<u4").tolist()
+            end = stream.tell() + size
+            unpacker = zlib.decompressobj()
+            while kind == 15 and stream.tell() < end and (part := stream.read(min(1 << 14, end - stream.tell()))):
+                try:
+                    count += len(unpacker.decompress(part))
+                except zlib.error:
+                    return  # which what reads it says
+                # numbers may be written in one byte that take eight in memory
+                _check_unpacked(8 * count)
+            stream.seek(end)
+
+
+def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
+    """The rows of which no layer above has a number, each with the numbers that were given last."""
+    if not layers:
+        return table
+    numbers = list(range(layers))
+    above = table[numbers].notna().any(axis=1)
+    table[numbers] = table[numbers].ffill()
+    return table[~above]
+
+
+def _layout_of(head: bytes, file_format: FileFormat) -> Layout:
+    """The layout of a text by its beginning; the first encoding is taken in which it has the names of a record."""
+    encodings = [file_format.tester.encoding] if file_format.tester and file_format.tester.encoding else ["utf-8", *ENCODINGS]
+    layouts = []
+    for encoding in encodings:
+        try:
+            # the head may end within a character
+            text = getincrementaldecoder(encoding)().decode(head, final=False).removeprefix("\ufeff")
+        except LookupError as error:
+            raise ValueError(f"the encoding {encoding!r} is not known") from error
+        except UnicodeDecodeError:
+            continue
+        layouts.append(_layout(text, encoding, file_format))
+        if encoding == "utf-8" or count_required(layouts[-1].names, file_format) == len(REQUIRED):
+            return layouts[-1]
+    if not layouts:
+        raise ValueError(f"the file is no text in {encodings[0]}")
+    return layouts[0]
+
+
+def _layout(text: str, encoding: str, file_format: FileFormat) -> Layout:
     lines = io.StringIO(text, newline=None).read().split("\n")
     delimiters: tuple[str, ...] = _DELIMITERS
     if stated := _DELIMITER_LINE.match(lines[0]):
         lines[0], delimiters = "", (stated[1],)
-    number, delimiter = _header(lines, delimiters, chosen)
+    number, delimiter = _header(lines, delimiters, file_format)
     rows = [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
-    names, clock = _names(_fields(lines[number], delimiter, len(next(filter(None, rows), lines))), rows)
+    names = _fields(lines[number], delimiter, len(next(filter(None, rows), lines)))
+    if len(names) > _MOST_COLUMNS:
+        raise ValueError(f"{len(names)} columns are more than the {_MOST_COLUMNS} that are read")
     layers = next((n for n, name in enumerate(names) if name), 0) if delimiter != _BLANKS else 0
     below = [any(row[:layers]) for row in rows if any(row)]
-    if sum(below) >= 0.5 * len(below):
+    if 2 * sum(below) >= len(below):
         layers = 0
     for n in range(layers):
         above = [fields[n] for fields in (_fields(line, delimiter) for line in lines[:number]) if any(fields[n : n + 1])]
         names[n] = above[-1] if above else ""
     values = [field for row in rows for field in row]
     commas, points = (sum(map(bool, map(mark.match, values))) for mark in (_DECIMAL_COMMA, _DECIMAL_POINT))
-    return _Layout(
-        encoding, number, delimiter, "," if commas > points and delimiter != _BLANKS else ".", names, layers, rows, clock
-    )
+    return Layout(encoding, number, delimiter, "," if commas > points and delimiter != _BLANKS else ".", names, layers, rows)
 
 
-def _names(names: list[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], int | None]:
-    """The names with an empty one where most rows have one field more, of their number or of a clock, whose column is told."""
-    filled = [[*itertools.dropwhile(operator.not_, row[::-1])][::-1] for row in rows if any(row)]
-    wider = [row for row in filled if len(row) > len(names)]
-    if len(wider) <= 0.5 * len(filled):
-        return names, None
-    if all(len(row) == len(names) + 1 for row in wider):
-        if [row[0] for row in wider] == [*map(str, range(1, len(wider) + 1))]:
-            return ["", *names], None
-        for n, fields in enumerate(itertools.pairwise(zip(*wider, strict=True)), start=1):
-            if all(map(_DATE.match, fields[0])) and all(map(_CLOCK.match, fields[1])):
-                return [*names[:n], "", *names[n:]], n
-    if not any(_count_numbers(row[len(names) :]) for row in wider):  # remarks
-        return names, None
-    raise ValueError(
-        f"rows have {len(wider[0])} fields below {len(names)} names, which does not tell what is what: name each column, and "
-        "take another delimiter than the decimal comma"
-    )
+def _check_width(layout: Layout) -> None:
+    """Refuse rows of more numbers than names, as nothing tells what is what; remarks behind them change nothing."""
+    rows, width = [row for row in layout.rows if any(row)], len(layout.names)
+    wider = [row for row in rows if any(row[width:])]
+    if 2 * len(wider) > len(rows) and any(_count_numbers(row[width:]) for row in wider):
+        raise ValueError(
+            f"rows have {len(wider[0])} fields below {width} names, which does not tell what is what: name each column, and "
+            "take another delimiter than the decimal comma"
+        )
 
 
-def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str, str] | None) -> tuple[int, str]:
+def _header(lines: Sequence[str], delimiters: Sequence[str], file_format: FileFormat) -> tuple[int, str]:
     """The line with the names of the columns, and the delimiter."""
-    filled = [number for number, line in enumerate(lines) if line.strip()]
+    filled = [number for number, line in enumerate(lines) if line.strip()][:_HEAD_LINES]
     if not filled:
         raise ValueError("the file is empty")
     best: dict[tuple[str, ...], tuple[int, str]] = {}
@@ -258,7 +318,7 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
                 has_numbers and (delimiter == _BLANKS or found == len(REQUIRED))
             ):
                 continue
-            count = count_required(names, chosen)
+            count = count_required(names, file_format)
             if count > found:
                 best, found = {}, count
             if count == found and (not best or not has_numbers):
@@ -267,10 +327,10 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
                 delimiters = (delimiter,)
                 break
     if best:
-        first, *others = best.values()
+        first, *others = itertools.islice(best.values(), 9)
         header = max([first, *others], key=lambda each: _fit(lines, *each)) if others else first
         if header != first:
-            warnings.warn(f"the header is line {header[0] + 1}; the table of line {first[0] + 1} is left out", stacklevel=2)
+            say(f"the header is line {header[0] + 1}; the table of line {first[0] + 1} is left out")
         return header
     # names come apart as often as the first numbers below them
     for above, number in itertools.pairwise([-1, *filled]):
@@ -281,13 +341,16 @@ def _header(lines: Sequence[str], delimiters: Sequence[str], chosen: Mapping[str
         if alike:
             return above, alike[0]
         if apart:
-            raise ValueError("there is no line with the names of the columns above the numbers. Add one")
+            raise ValueError(
+                "there is no line with the names of the columns above the numbers. Add one. The first line of numbers: "
+                f"{lines[number][:99]}"
+            )
     return filled[0], delimiters[0]
 
 
 def _fit(lines: Sequence[str], number: int, delimiter: str) -> int:
     """How well the lines below a header hold numbers in as many fields as it has names; a delimiter may end each."""
-    rows = [_fields(line, delimiter) for line in lines[number + 1 :]]
+    rows = [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
     width = len(_fields(lines[number], delimiter, max(map(len, rows), default=0)))
     filled = [len([*filter(None, row)]) if _count_numbers(row) > 1 else -1 for row in rows]
     return sum(2 * (count >= 0 and len(row) == width) or count == width for row, count in zip(rows, filled, strict=True))
@@ -295,20 +358,6 @@ def _fit(lines: Sequence[str], number: int, delimiter: str) -> int:
 
 def _count_numbers(fields: Sequence[str]) -> int:
     return sum(bool(_NUMBER.match(field) or _DECIMAL_COMMA.match(field)) for field in fields)
-
-
-def _decoded(head: bytes) -> tuple[str, str]:
-    for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
-        if head.startswith(mark):
-            return encoding, head.decode(encoding, errors="ignore")
-    if b"\0" in head:
-        raise ValueError("the file is binary, and its ending is none of those that can be read")
-    try:
-        # the head may end within a character
-        return "utf-8", getincrementaldecoder("utf-8")().decode(head, final=len(head) < _HEAD_BYTES)
-    except UnicodeDecodeError:
-        encoding = "gb18030" if "电压".encode("gb18030") in head else "latin-1"
-        return encoding, head.decode(encoding, errors="ignore")
 
 
 def _fields(line: str, delimiter: str, most: float = np.inf) -> list[str]:
@@ -339,60 +388,105 @@ def _reading(kind: str, extra: str) -> Iterator[None]:
         raise ValueError(f"the file is damaged, or no {kind} file: {str(error).strip()}") from error
 
 
+class Sheet(NamedTuple):
+    """A sheet of a workbook that may hold the record."""
+
+    title: str
+    header: list[str]  # of its columns; what is above is left out
+    known: int  # quantities of a record in the header
+    rows: list[list[str]]  # below the header
+
+
+def _sheets(path: Path) -> Iterator[tuple[str, Iterable[Sequence[Any]]]]:
+    """Each sheet's title and its rows, as wide as they are filled: a single cell may lie in the last corner of a sheet."""
+    if path.read_bytes()[:4] == _WORKBOOKS[0]:
+        import openpyxl
+
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        for sheet in book.worksheets:
+            sheet.reset_dimensions()
+            yield sheet.title, sheet.iter_rows(values_only=True)
+    else:
+        import xlrd
+
+        with xlrd.open_workbook(path, ragged_rows=True, on_demand=True) as book:
+            for sheet in book.sheets():
+                yield sheet.name, ([_cell_of_xls(cell, book.datemode) for cell in row] for row in sheet.get_rows())
+
+
+def _cell_of_xls(cell: Any, datemode: int) -> Any:
+    import xlrd
+
+    return xlrd.xldate_as_datetime(cell.value, datemode) if cell.ctype == xlrd.XL_CELL_DATE else cell.value
+
+
 def _sheet(path: Path, file_format: FileFormat) -> bytes:
     """The sheet of a workbook that holds the record, and those that continue it, as text."""
     with _reading("Excel", "excel"):
-        sheets = pd.read_excel(path, sheet_name=None, header=None, dtype=object)
-    found = []
-    for sheet in sheets.values():
-        head = [[str(name) for name in row] for row in sheet.head(_FIRST_ROWS).to_numpy()]
-        known = [count_required(names, file_format.columns) for names in head] or [0]
-        line = int(np.argmax(known))
-        found.append((known[line], len(sheet), head[line : line + 1], line, sheet))
-    names = max(found, key=lambda each: each[:2])[2]
-    (top, first), *others = [(line, sheet) for *_, each, line, sheet in found if each == names]
-    parts, header = [first, *(sheet.iloc[line + 1 :] for line, sheet in others)], [name for row in names for name in row]
-    if others and not has("cycle", header):  # each may be a test of its own
-        parts = [part.assign(cycle=str(number)) for number, part in enumerate(parts, start=1)]
-        parts[0].iloc[top, -1] = "Cycle"
-    elif others and not has("cell", header):  # each whose clock and cycles do not go on is a cell of its own
-        columns = find_columns(header, file_format, ())
-        places = [columns[each].position for each in ("time", "cycle") if each in columns]
-        counts = [part.iloc[:, places].apply(pd.to_numeric, errors="coerce").dropna() for part in parts]
-        if all(len(each) and each.iloc[:, 0].is_monotonic_increasing for each in counts):
-            anew = [True, *((after.iloc[0] <= before.iloc[-1]).all() for before, after in itertools.pairwise(counts))]
-            titles = pd.Series([title for title, each in zip(sheets, found, strict=True) if each[2] == names])
-            cells = titles.where(pd.Series(anew)).ffill()
-            parts = [part.assign(cell=cell) for part, cell in zip(parts, cells, strict=True)]
-            parts[0].iloc[top, -1] = "Cell"
-    return pd.concat(parts).to_csv(header=False, index=False).encode()
+        found = [_read_sheet(title, rows, file_format) for title, rows in _sheets(path)]
+    best = max(found, key=lambda sheet: (sheet.known, len(sheet.rows)))
+    parts = [sheet for sheet in found if sheet.header == best.header]
+    # each may be a test of its own
+    numbered = len(parts) > 1 and not has("cycle", best.header)
+    text = io.StringIO()
+    writer, width = csv.writer(text, lineterminator="\n"), len(best.header)
+    writer.writerow([*best.header, *["Cycle"] * numbered])
+    for number, sheet in enumerate(parts, start=1):
+        writer.writerows([*row[:width], *[""] * (width - len(row)), *[number] * numbered] for row in sheet.rows)
+    return text.getvalue().encode()
 
 
-def _read_parquet(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, dict[str, Column]]:
+def _read_sheet(title: str, rows: Iterable[Sequence[Any]], file_format: FileFormat) -> Sheet:
+    """A sheet from its header on; refused where it is too large."""
+    kept: list[list[str]] = []
+    size = 0
+    for row in rows:
+        fields = ["" if value is None else str(value) for value in row]
+        while fields and not fields[-1]:
+            fields.pop()
+        if len(fields) > _MOST_COLUMNS:
+            raise ValueError(f"{len(fields)} columns in sheet {title!r} are more than the {_MOST_COLUMNS} that are read")
+        if fields:
+            kept.append(fields)
+            size += sum(map(len, fields)) + 60 * len(fields)  # as Python keeps text
+            _check_unpacked(size)
+    known = [count_required(fields, file_format) for fields in kept[:_FIRST_ROWS]] or [0]
+    line = int(np.argmax(known))
+    return Sheet(title, kept[line] if kept else [], max(known), kept[line + 1 :])
+
+
+def _open_parquet(path: Path) -> Opened:
+    """A file whose footer says how large its columns are; text is kept once, however often it comes."""
     with _reading("Parquet", "parquet"):
-        from pyarrow import parquet
+        from pyarrow import parquet, types
 
-        file = parquet.ParquetFile(path)
-    with file:
-        first = [batch.to_pandas() for batch in itertools.islice(file.iter_batches(_FIRST_ROWS), 1)]
-        columns = find_columns(file.schema_arrow.names, file_format, _first_rows(first[0]) if first else ())
-        # the metadata of pandas would make an index of a column
-        table = _read_batches(file, path.stat().st_size, sorted({column.name for column in columns.values()}))
-    return pd.DataFrame({quantity: table[column.name] for quantity, column in columns.items()}), columns
+        with parquet.ParquetFile(path) as file:
+            metadata, fields = file.metadata, list(file.schema_arrow)
+            _check_rows(metadata.num_rows, path.stat().st_size)
+            sizes: Counter[str] = Counter()
+            for group, n in itertools.product(range(metadata.num_row_groups), range(metadata.num_columns)):
+                chunk = metadata.row_group(group).column(n)
+                sizes[chunk.path_in_schema.split(".")[0]] += chunk.total_uncompressed_size
+    is_text = {each.name: types.is_string(each.type) or types.is_large_string(each.type) for each in fields}
+    is_plain = {each.name: not types.is_nested(each.type) and not types.is_binary(each.type) for each in fields}
+    usable = [each.name for each in fields if is_plain[each.name] and sizes[each.name] <= LARGEST_UNPACKED_BYTES // 8]
 
+    def read(names: Sequence[str], most_rows: int | None = None) -> pd.DataFrame:
+        text = [name for name in names if is_text[name]]
+        with _reading("Parquet", "parquet"), parquet.ParquetFile(path, read_dictionary=text) as file:
+            # the metadata of pandas would make an index of a column
+            if most_rows is None:
+                return file.read(columns=names).to_pandas(ignore_metadata=True)
+            first = next(file.iter_batches(most_rows, columns=names), None)
+            return pd.DataFrame(columns=[*names]) if first is None else first.to_pandas(ignore_metadata=True)
 
-def _read_batches(file: Any, packed_bytes: int, names: list[str]) -> pd.DataFrame:
-    from pyarrow import Table
+    def read_columns_of(found: Recognised) -> pd.DataFrame:
+        table = read(sorted({column.name for column in found.columns.values()}))
+        return pd.DataFrame({key: table[column.name] for key, column in found.columns.items()})
 
-    batches, count = [], 0
-    try:
-        for batch in file.iter_batches(_BATCH_ROWS, columns=names):
-            count += batch.nbytes
-            check_unpacked(packed_bytes, count)
-            batches.append(batch)
-    except OSError as error:  # what pyarrow calls damage
-        raise ValueError(f"the file is damaged: {str(error).strip()}") from error
-    return Table.from_batches(batches, batches[0].schema if batches else file.schema_arrow).to_pandas(ignore_metadata=True)
+    names = [each.name if each.name in usable else "" for each in fields]
+    head = read(usable, _FIRST_ROWS).reindex(columns=[each.name for each in fields])
+    return Opened(names, _first_rows(head), read_columns_of)
 
 
 def _read_neware(path: Path) -> pd.DataFrame:

@@ -1,0 +1,233 @@
+"""The testers whose files are known: a row each, of what it calls its columns and how it counts. Users add rows as files."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+#: What a column may hold, and what a record must have.
+QUANTITIES = tuple(
+    "time date step_time voltage counter current power charge_step temperature ambient capacity cycle step cell state".split()
+)
+REQUIRED = ("time", "voltage", "current")
+
+
+@dataclass(frozen=True)
+class Tester:
+    """
+    How a tester writes its tables.
+
+    :param name: what it is called
+    :param columns: by quantity, the names of its column without units, the first that a table has is taken. Capitals, blanks
+        and signs do not count. ``time`` runs through the test and ``step_time`` starts anew with each step; ``counter`` is an
+        electrode against which the voltage is measured, ``charge_step`` the charge since the row before, and ``capacity`` the
+        tester's own count of what is drawn
+    :param told_by: names of which a table of this tester has one
+    :param units: by quantity, its unit where the name in the table says none; else s, V, A, degC and Ah
+    :param discharge_is_negative: how the current of a discharge is counted, where voltage and words do not tell
+    :param encoding: of its text, where that is not UTF-8
+    :param missing: what it writes for a value that was not measured, besides nothing and NaN
+    """
+
+    name: str
+    columns: Mapping[str, Sequence[str]]
+    told_by: Sequence[str] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    discharge_is_negative: bool | None = None
+    encoding: str = ""
+    missing: Sequence[str] = ()
+
+
+def _row(name: str, told_by: str, negative: bool | None = None, encoding: str = "", missing: str = "", **names: str) -> Tester:
+    columns = {quantity: _listed(text) for quantity, text in names.items()}
+    return Tester(name, columns, _listed(told_by), {}, negative, encoding, _listed(missing))
+
+
+def _listed(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+# Names that are plain, too, are only in the row of these, but for clocks: which of a tester's names runs through the test, and
+# which starts anew with each step, differs.
+_KNOWN = (
+    _row(
+        "Arbin", "Data_Point, Internal_Resistance, dV/dt", negative=True, time="Test_Time", date="Date_Time",
+        step_time="Step_Time", temperature="Aux_Temperature_1, Aux_Temperature", cell="Channel_ID",
+    ),
+    _row(
+        "Maccor", "DPT Time, Amp-hr, Rec#, Cycle P", missing="N/A", time="TestTime, Test", date="DPT Time",
+        step_time="StepTime, Step Sec, Step Min", voltage="Volts, mVolts", current="Amps, mAmps", capacity="Amp-hr, Cap.",
+        temperature="Temp 1, EV Temp", cycle="Cyc#, Cycle P, Cycle C", state="State, Md",
+    ),
+    _row(
+        "BioLogic", "Ewe, Ecell, Ewe-Ece, <Ewe>, Ns changes", negative=True, encoding="latin-1", time="time",
+        step_time="step time", voltage="Ewe-Ece, Ecell, Ewe, <Ewe>", counter="Ece", current="I, <I>", power="P, Pwe",
+        charge_step="dq", capacity="Q discharge", cycle="cycle number", step="Ns",
+    ),
+    _row(
+        "Neware", "DataPoint, Record number, Record ID, Chg. Cap., DChg. Cap., Relative Time, Cumulative Time, 工步号",
+        encoding="gb18030", missing="--", time="Total Time, Cumulative Time, Test Time, 总时间, 累计时间",
+        date="Date, Absolute Time, Realtime, Timestamp, 绝对时间, 系统时间, 日期",
+        step_time="Time, Step Time, Relative Time, 时间, 相对时间, 步骤时间, 工步时间", voltage="Voltage, 电压",
+        current="Current, Cur, 电流", temperature="T1, 温度, 电池温度", capacity="DChg. Cap., Capacitance DChg, 放电容量",
+        cycle="Cycle Index, Cycle ID, 循环, 循环号, 循环序号", step="Step Index, Step ID, 工步, 工步号, 工步序号",
+        state="Step Type, 状态, 工步类型, 工步状态",
+    ),
+    _row(
+        "Basytec", "t-Step, t-Set, Ah-Step, Ah-Cyc-Discharge", negative=True, encoding="latin-1", time="~Time, Time, Zeit",
+        date="Date", step_time="t-Step", capacity="Ah-Cyc-Discharge", cycle="Cyc-Count", step="Line", state="Command",
+    ),
+    _row(
+        "Novonix", "Run Time, Circuit Temperature", negative=True, encoding="latin-1", time="Run Time", date="Date and Time",
+        step_time="Step Time", voltage="Potential",
+    ),
+    _row(
+        "Digatron", "Prog Time, Program Time, Program Duration, Programmdauer, AhAccu, AhStep", negative=True,
+        encoding="latin-1", time="Prog Time, Program Time, Program Duration, Programmdauer, Programmzeit",
+        date="Time Stamp, Zeitstempel", step_time="Step Time, Step Duration, Schrittdauer", temperature="LogTemp001",
+    ),
+    _row(
+        "Landt", "channel_index, SysTime, Step-State, 测试时间", encoding="gb18030", time="TestTime, 测试时间",
+        date="SysTime, Date Time ISO string, 系统时间", step_time="StepTime, 工步时间", temperature="Temperature 1",
+        state="Step Name, StepMode, Step-State",
+    ),
+    _row(
+        "PEC", "Load On Time, Position Start Time", negative=True, time="Total Time", date="Real Time", step_time="Step Time",
+        state="Instruction Name",
+    ),
+    _row("Gamry", "Vf, Im", time="T", voltage="Vf", current="Im"),
+    _row("EBC", "Vol", encoding="gb18030", time="Time, Sec", voltage="Vol", current="Cur"),
+    _row(
+        "Battery Archive (Sandia, CALCE)", "Environment_Temperature", negative=True, time="Test_Time", date="Date_Time",
+        temperature="Cell_Temperature", ambient="Environment_Temperature",
+    ),
+    _row("CALCE (text of Cadex)", "mV", time="Time", voltage="mV", current="mA"),
+    _row(
+        "Battery Data Format", "Unix Time, Test Time", negative=True, time="Test Time", date="Unix Time, Date Time",
+        step_time="Step Time", temperature="Surface Temperature T1, Temperature T1", capacity="Discharging Capacity",
+    ),
+)  # fmt: skip
+_PLAIN = _row(
+    "plain", "", encoding="latin-1", missing="--, ---, N/A, n.a., -",
+    time="time, total time, elapsed time, accumulated time, record time, elapsed, test, relative time, seconds, t, testzeit, "
+    "prüfzeit, gesamtzeit, laufzeit, zeit, temps total, temps, tempo, tiempo",
+    date="date time, timestamp, date, absolute time, system time, datum, datum uhrzeit, fecha",
+    step_time="step time, t step, schrittzeit, temps étape",
+    voltage="voltage, cell voltage, terminal voltage, battery voltage, voltage measured, measured voltage, volts, volt, u, v, "
+    "cell potential, u cell, v cell, u bat, v bat, u batt, v batt, spannung, zellspannung, klemmenspannung, u zelle, "
+    "batteriespannung, tension, tension cellule, tensión, tensão, tensao, voltaje",
+    current="current, cell current, battery current, current measured, measured current, curr, amps, amp, i, i cell, i bat, "
+    "i batt, strom, zellstrom, batteriestrom, courant, corriente, corrente",
+    power="power, p, leistung",
+    temperature="temperature, cell temperature, temperature measured, surface temperature, temp, temp 1, t1, t cell, t, "
+    "temperatur, zelltemperatur, température, temperatura",
+    ambient="ambient temperature, chamber temperature, environment temperature, umgebungstemperatur",
+    capacity="discharge capacity, discharged capacity, capacity, cap, ah, entladekapazität, kapazität",
+    cycle="cycle, cycle index, cycle number, cycle no, cycle count, cyc, zyklus, zyklusnummer, ciclo",
+    step="step, step index, step number, step no, steps, schritt, schrittnummer, etape, étape",
+    state="state, status, mode, step type, zustand",
+    cell="cell id, cell name, cell number, cell no, cell, battery id, battery, barcode, serial number, channel, "
+    "channel number, zelle",
+)  # fmt: skip
+
+
+def joined(first: Tester, others: Sequence[Tester], clocks: bool = True) -> Tester:
+    """A row that knows the names of others behind its own; those of clocks, which differ in what they count, if asked for."""
+    columns = {
+        quantity: list(dict.fromkeys(name for each in (first, *others) for name in each.columns.get(quantity, ())))
+        for quantity in QUANTITIES
+        if clocks or quantity not in ("time", "date", "step_time")
+    }
+    missing = list(dict.fromkeys(text for each in (first, *others) for text in each.missing))
+    return replace(first, columns={**first.columns, **columns}, missing=missing)
+
+
+_ANY = joined(_PLAIN, _KNOWN)
+#: The rows, in the order in which they are tried; the last one knows the names of all.
+TESTERS = (*(joined(each, [_ANY], clocks=False) for each in _KNOWN), _ANY)
+#: How text is encoded that is not UTF-8.
+ENCODINGS = tuple(dict.fromkeys(each.encoding for each in (_PLAIN, *_KNOWN) if each.encoding))
+
+
+def find_tester(name: str | Path | Tester) -> Tester:
+    """A tester by its name, or from a file in TOML as :func:`tester_file` writes it."""
+    if isinstance(name, Tester):
+        return name
+    for tester in TESTERS:
+        if tester.name.lower() == str(name).strip().lower():
+            return tester
+    path = Path(name)
+    if not path.is_file():
+        known = ", ".join(tester.name for tester in TESTERS)
+        raise FileNotFoundError(f"no file {str(name)!r}, nor a tester of this name: known are {known}")
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # of the encoding, or of TOML
+        raise ValueError(f"{path} is no file in TOML: {error}") from error
+    return _checked(path, content)
+
+
+def _checked(path: Path, content: dict[str, Any]) -> Tester:
+    kinds = dict(name=str, columns=dict, units=dict, discharge_is_negative=bool, encoding=str, missing=list)
+    for key, value in content.items():
+        if key not in kinds or not isinstance(value, kinds[key]):
+            known = ", ".join(f"{name} ({kind.__name__})" for name, kind in kinds.items())
+            raise ValueError(f"{path}: a tester has {known}, got {key} = {value!r}")
+    columns = {key: [value] if isinstance(value, str) else value for key, value in content.get("columns", {}).items() if value}
+    units = {key: value for key, value in content.get("units", {}).items() if value}
+    for key, value in (*columns.items(), *units.items()):
+        if key not in QUANTITIES or not all(isinstance(text, str) for text in value):
+            raise ValueError(f"{path}: names and units are text by quantity ({', '.join(QUANTITIES)}), got {key} = {value!r}")
+    own = Tester(
+        content.get("name", path.stem),
+        columns,
+        units=units,
+        discharge_is_negative=content.get("discharge_is_negative"),
+        encoding=content.get("encoding", ""),
+        missing=content.get("missing", []),
+    )
+    return joined(own, [_ANY])
+
+
+def tester_file(columns: Mapping[str, Any], names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """
+    A file in TOML to fill in.
+
+    :param columns: what was recognised, by quantity, with a ``name`` and a ``unit``
+    :param names: all names of the table
+    :param rows: its first rows
+    """
+    lines: dict[str, list[str]] = {"columns": [], "units": []}
+    for quantity in QUANTITIES:
+        found = columns.get(quantity)
+        for part, text in (("columns", found.name if found else ""), ("units", found.unit if found else "")):
+            lines[part].append(f"{'' if text else '# '}{quantity} = {_quoted(text)}")
+    return "\n".join(
+        [
+            "# A tester for battery-calibrate --tester: its columns by name, and units that the names do not tell.",
+            *(f"# {_quoted(', '.join(fields)[:200])}" for fields in (names, *rows[:2])),
+            'name = "my tester"',
+            "# discharge_is_negative = true  # where the voltage does not tell",
+            '# encoding = "latin-1"  # where the text is not UTF-8',
+            '# missing = ["--"]  # what stands for a value that was not measured',
+            "[columns]",
+            *lines["columns"],
+            "[units]",
+            *lines["units"],
+            "",
+        ]
+    )
+
+
+def _quoted(text: str) -> str:
+    """Text of TOML, whose basic strings are those of JSON."""
+    return json.dumps(text, ensure_ascii=False)
