@@ -3,6 +3,7 @@
 import csv
 import gzip
 import io
+import re
 import warnings
 
 import numpy as np
@@ -153,7 +154,12 @@ def test_whatever_is_put_together_the_discharges_are_those_that_were_written(tmp
         f |= {"clock": "time", "beside": set(), "index": False, "cut": False}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        found = read_discharges(write(f, tmp_path))
+        try:
+            found = read_discharges(write(f, tmp_path))
+        except ValueError as refused:  # rows that come again and a clock at midnight go back, and row numbers have no name
+            assert f["repeated"] or f["clock"] == "day" or f["index"]
+            assert re.search(r"the clock goes back: row \d+|rows have \d+ fields below", str(refused)), refused
+            return
     assert len(found) == f["cycles"]
     unseen_C = 10.0 * (1 + f["cut"] + (f["edge"] == "mixed"))  # a row that is missing, or of two steps
     for discharge in found:

@@ -126,7 +126,7 @@ def find_columns(
 
 def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]]) -> Recognised:
     """
-    Which tester's table it is, the first of whose row the table has all that a record needs, and its columns. A unit is told
+    Which tester's table it is, the first of which it has all that a record needs, and its columns. A unit is told
     from the name, as in ``Current(mA)``, ``Voltage / V``, ``mAmps`` or ``test_time_second``, or from the line below it; one of
     another quantity rules a column out.
     """
@@ -138,15 +138,17 @@ def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequ
     units = rows[0] if rows and are_units(rows[0]) else []
     labels = [_label(name, text) for name, text in zip_longest(kept, units[: len(kept)])]
     present = {key for name in labels for key, *_ in _readings(name)}
+    given = {"current"} if file_format.load else set[str]()
+    candidates = []
     for tester in (file_format.tester,) if file_format.tester else TESTERS:
-        if tester is not TESTERS[-1] and tester.told_by and not present & set(map(_key, tester.told_by)):
-            continue
-        found = _columns_of(tester, kept, labels, rows, file_format)
-        given = {"current"} if file_format.load else set[str]()
-        missing = [each for each in REQUIRED if not {each, *INSTEAD.get(each, ())} & (set(found) | given)]
-        if not missing:
-            break
-    return Recognised(tester, found, missing)
+        if tester is TESTERS[-1] or not tester.told_by or present & set(map(_key, tester.told_by)):
+            found = _columns_of(tester, kept, labels, rows, file_format)
+            missing = [each for each in REQUIRED if not {each, *INSTEAD.get(each, ())} & (set(found) | given)]
+            candidates.append(Recognised(tester, found, missing))
+            if not missing and "time" in found:
+                return candidates[-1]
+    # the time in a step, or a date, where no tester's row has the time of the test
+    return next((each for each in candidates if not each.missing), candidates[-1])
 
 
 def _columns_of(

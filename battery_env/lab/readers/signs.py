@@ -30,7 +30,7 @@ class _Stretches(NamedTuple):
     is_long: BoolArray  # passes much of what the longest one does
     jump_V: FloatArray  # over the switch
     fall_V: FloatArray  # from then on; 0 where the load was reduced, as the voltage recovers then
-    is_fresh: BoolArray  # begins with a load of another sign, or none, before
+    is_fresh: BoolArray  # follows upon a load of another sign, or a rest
 
     @classmethod
     def of(cls, rows: pd.DataFrame) -> _Stretches:
@@ -51,9 +51,7 @@ class _Stretches(NamedTuple):
         after_rest = (before == 0.0) & (begin > 0)
         is_long = charge_C >= MUCH_SHARE * charge_C.max()
         fall_V[is_reduced | (sign == 0.0)] = 0.0
-        # of the first one nobody knows, unless it is most of the record
-        is_fresh = (before != sign) & ((begin > 0) | (charge_C > 0.5 * charge_C.sum()))
-        return cls(begin, sign, after_rest, is_long, jump_V, fall_V, is_fresh)
+        return cls(begin, sign, after_rest, is_long, jump_V, fall_V, (before != sign) & (begin > 0))
 
 
 def with_signed_current(rows: pd.DataFrame, known: Recognised, is_negative: bool | None) -> pd.DataFrame:
@@ -75,7 +73,8 @@ def with_signed_current(rows: pd.DataFrame, known: Recognised, is_negative: bool
             return rows.assign(current=current_A.abs().mask(towards < 0, -current_A.abs()))
         _refuse_unsigned(rows, stretches, known.columns)
     if is_negative is None:
-        evidence = [_agreement(rows, rest_A), _jumps(rows), _falls(stretches)]
+        jumps = _jumps(rows)
+        evidence = [_agreement(rows, rest_A), jumps, _falls(stretches, bool(jumps))]
         clear = [each for each in evidence if abs(each) > _CLEAR]
         by_tester = known.tester.discharge_is_negative
         if min(clear, default=0.0) < 0.0 < max(clear, default=0.0) or (not clear and by_tester is None):
@@ -112,13 +111,13 @@ def _jumps(rows: pd.DataFrame) -> float:
     return -float(np.sign(jump_A[n] * jump_V) @ np.abs(jump_A[n]) / np.abs(jump_A[n]).sum()) if len(n) else 0.0
 
 
-def _falls(stretches: _Stretches) -> float:
+def _falls(stretches: _Stretches, are_switched: bool) -> float:
     """
     How the voltage falls while a current of one sign flows on, -1 to 1: each stretch counts by what it changes, so that a load
-    that follows the voltage, as a constant power does, tells as plainly as a constant current. After another load the voltage
-    may recover.
+    that follows the voltage, as a constant power does, tells as plainly as a constant current. Where loads are switched the
+    voltage may recover from one that was larger.
     """
-    fall_V = np.where(stretches.is_fresh, stretches.fall_V, 0.0)
+    fall_V = np.where(stretches.is_fresh, stretches.fall_V, 0.0) if are_switched else stretches.fall_V
     whole_V = np.abs(fall_V).sum()
     return float(stretches.sign @ fall_V / whole_V) if whole_V > 0.0 else 0.0
 

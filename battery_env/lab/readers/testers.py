@@ -47,9 +47,12 @@ class Tester:
     missing: Sequence[str] = ()
 
 
-def _row(name: str, told_by: str, negative: bool | None = None, encoding: str = "", missing: str = "", **names: str) -> Tester:
+def _row(
+    name: str, told_by: str, negative: bool | None = None, encoding: str = "", missing: str = "", count: str = "", **names: str
+) -> Tester:
     columns = {quantity: _listed(text) for quantity, text in names.items()}
-    return Tester(name, columns, _listed(told_by), {}, negative, encoding, _listed(missing))
+    units = {"capacity": count} if count else {}
+    return Tester(name, columns, _listed(told_by), units, negative, encoding, _listed(missing))
 
 
 def _listed(text: str) -> list[str]:
@@ -60,11 +63,11 @@ def _listed(text: str) -> list[str]:
 # which starts anew with each step, differs.
 _KNOWN = (
     _row(
-        "Arbin", "Data_Point, Internal_Resistance, dV/dt", negative=True, time="Test_Time", date="Date_Time",
+        "Arbin", "Data_Point, dV/dt", negative=True, count="Ah", time="Test_Time", date="Date_Time",
         step_time="Step_Time", temperature="Aux_Temperature_1, Aux_Temperature", cell="Channel_ID",
     ),
     _row(
-        "Maccor", "DPT Time, Amp-hr, Rec#, Cycle P", missing="N/A", time="TestTime, Test", date="DPT Time",
+        "Maccor", "DPT Time, Amp-hr, Rec#, Cycle P", missing="N/A", count="Ah", time="TestTime, Test", date="DPT Time",
         step_time="StepTime, Step Sec, Step Min", voltage="Volts, mVolts", current="Amps, mAmps", capacity="Amp-hr, Cap.",
         temperature="Temp 1, EV Temp", cycle="Cyc#, Cycle P, Cycle C", state="State, Md",
     ),
