@@ -213,7 +213,7 @@ def declared(distributions, extras):
 @pytest.mark.parametrize(
     ("package", "distributions", "extras"),
     [
-        ("battery_env", ("battery_env",), ("cluster", "cyclers", "onnx", "page", "parquet", "sb3")),
+        ("battery_env", ("battery_env",), ("cluster", "cyclers", "excel", "onnx", "page", "parquet", "sb3")),
         ("sb3_lac", (".",), ("zoo", "onnx")),
         ("benchmarks", ("battery_env", "."), ("zoo", "peers", "pybop")),
         ("tests", ("battery_env", "."), ("zoo", "peers", "onnx", "dev")),
