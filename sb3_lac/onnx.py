@@ -35,23 +35,26 @@ _FAR = 1e6
 class DeterministicPolicy(th.nn.Module):
     """
     ``predict(observation, deterministic=True)`` as one graph of tensors, from the environment's observations to its actions.
+    Of several policies it has the mean.
 
-    :param policy: A policy with ``Box`` observations and actions
-    :param vec_normalize: What normalizes its observations, if anything does
+    :param policies: Policies of the same ``Box`` observations and actions
+    :param vec_normalize: What normalizes their observations, if anything does
     """
 
+    policies: Sequence[BasePolicy]
     low: th.Tensor
     high: th.Tensor
     mean: th.Tensor
     rest_of_mean: th.Tensor
     deviation: th.Tensor
 
-    def __init__(self, policy: BasePolicy, vec_normalize: VecNormalize | None = None) -> None:
+    def __init__(self, policies: Sequence[BasePolicy], vec_normalize: VecNormalize | None = None) -> None:
         super().__init__()
-        assert isinstance(policy.action_space, spaces.Box)
-        self.policy = policy
-        self.register_buffer("low", th.as_tensor(policy.action_space.low, dtype=th.float32))
-        self.register_buffer("high", th.as_tensor(policy.action_space.high, dtype=th.float32))
+        action_space = policies[0].action_space
+        assert isinstance(action_space, spaces.Box)
+        self.policies = th.nn.ModuleList(policies)  # type: ignore[assignment]
+        self.register_buffer("low", th.as_tensor(action_space.low, dtype=th.float32))
+        self.register_buffer("high", th.as_tensor(action_space.high, dtype=th.float32))
         self.clip_obs: float | None = None
         if vec_normalize is not None:
             assert isinstance(vec_normalize.obs_rms, RunningMeanStd)  # of a Box
@@ -62,34 +65,20 @@ class DeterministicPolicy(th.nn.Module):
             self.register_buffer("rest_of_mean", (mean - mean.float()).float())
             variance = vec_normalize.obs_rms.var + vec_normalize.epsilon
             self.register_buffer("deviation", th.as_tensor(np.sqrt(variance), dtype=th.float32))
-        self.to(policy.device)
+        self.to(policies[0].device)
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
         """Compute actions of the environment from its observations."""
         if self.clip_obs is not None:
             observation = (observation - self.mean - self.rest_of_mean) / self.deviation
             observation = observation.clamp(-self.clip_obs, self.clip_obs)
-        action = self.policy._predict(observation, deterministic=True).reshape(-1, *self.low.shape)
-        if self.policy.squash_output:
-            return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
-        return action.clamp(self.low, self.high)
-
-
-class MeanPolicy(th.nn.Module):
-    """
-    The mean of the actions of several policies.
-
-    :param policies: Of the same spaces
-    """
-
-    def __init__(self, policies: Sequence[DeterministicPolicy]) -> None:
-        super().__init__()
-        self.policies = th.nn.ModuleList(policies)
-        self.low, self.high = policies[0].low, policies[0].high
-
-    def forward(self, observation: th.Tensor) -> th.Tensor:
-        """Compute actions of the environment from its observations."""
-        return th.stack([policy(observation) for policy in self.policies]).mean(dim=0)
+        actions = []
+        for policy in self.policies:
+            action = policy._predict(observation, deterministic=True).reshape(-1, *self.low.shape)
+            if policy.squash_output:
+                action = self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+            actions.append(action.clamp(self.low, self.high))
+        return th.stack(actions).mean(dim=0)
 
 
 def export_onnx(
@@ -183,7 +172,7 @@ def _checked_file(
     for each in policies:
         each.set_training_mode(False)
     try:
-        module = MeanPolicy([DeterministicPolicy(each, vec_normalize) for each in policies]).eval()
+        module = DeterministicPolicy(policies, vec_normalize).eval()
         observations = observations_to_check(policy.observation_space, vec_normalize)
         seen = observations if vec_normalize is None else vec_normalize.normalize_obs(observations)
         expected = np.mean([each.predict(seen, deterministic=True)[0] for each in policies], axis=0)
@@ -246,7 +235,7 @@ def with_checksum(content: bytes) -> bytes:
     return content + ModelProto(metadata_props=[entry]).SerializeToString()
 
 
-def graph_of(module: MeanPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:
+def graph_of(module: DeterministicPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:
     """Export a module, and describe it."""
     import onnx
 

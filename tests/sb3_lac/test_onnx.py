@@ -90,7 +90,7 @@ def test_a_mean_far_larger_than_the_deviation_loses_no_digits():
     observations = (29_315.0 + np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))).astype(np.float32)
     expected, _ = model.predict(env.normalize_obs(observations), deterministic=True)
     with th.no_grad():
-        actions = onnx.DeterministicPolicy(model.policy, env)(th.as_tensor(observations)).numpy()
+        actions = onnx.DeterministicPolicy([model.policy], env)(th.as_tensor(observations)).numpy()
     np.testing.assert_allclose(actions, expected, atol=1e-6)
 
 
