@@ -28,6 +28,7 @@ from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.loads import constant
 from battery_env.tasks.data import standard_dataset
+from battery_env.tasks.env import CalibrationEnv
 from battery_env.tasks.full_state.task import FullStateTask
 from battery_env.tasks.registration import TASKS
 from battery_env.trajectories import TrajectoryDataset
@@ -61,7 +62,7 @@ def ids() -> str:
     dataset = TrajectoryDataset.generate(("q_mobile", "r_o"), 4, [constant(8.0)], seed=0)
     rows = []
     for env_id in TASKS:
-        task = load_env_creator(TASKS[env_id])(1, dataset=dataset)
+        task = CalibrationEnv(TASKS[env_id], dataset=dataset).task
         rows.append(
             {
                 "id": f"[`{env_id}`](environments/{env_id}.md)",
