@@ -16,7 +16,7 @@ simulated cells of the path, from the error of the simulated state; no recorded 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -54,14 +54,17 @@ from battery_env.records import drawn
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
 from battery_env.records.model import RecordModel
 from benchmarks.study import (
+    Cell,
     Study,
     Tables,
     command_line,
+    count_of,
     digits,
     markdown,
     natural,
     new_panels,
     positive,
+    table_of,
     versions,
 )
 from benchmarks.training import Recipe, train_or_load, training_minutes
@@ -293,27 +296,27 @@ def _steps_V(record: Discharge, charge_C: float) -> FloatArray:
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
     """One line a cell and method: the mean errors at each share, and over seeds the least and the most of them."""
-    lines = []
-    for (cell, method), group in rows.groupby(["cell", "method"], sort=False):
-        ends = [each for _, each in group[group["share"] < 1.0].groupby("share")]
-        line: dict[str, object] = {
-            "cell": cell,
-            "method": method,
-            "end at 25 / 50 / 75 %: mean error (%)": " / ".join(_over_seeds(each, "error_percent") for each in ends),
-            "worst (%)": " / ".join(digits(each["error_percent"].abs().max()) for each in ends),
-            "inside 90 % (%)": "",
-            "whole: q_max off least squares, mean (worst) (%)": "",
-            "settled, whole": "",
-        }
-        if group["covered"].notna().any():
-            line["inside 90 % (%)"] = " / ".join(f"{100.0 * each['covered'].mean():.0f}" for each in ends)
-        whole = group[group["share"] == 1.0]
-        if len(whole):
-            worst = digits(whole["q_error_percent"].abs().max())
-            line["whole: q_max off least squares, mean (worst) (%)"] = f"{_over_seeds(whole, 'q_error_percent')} ({worst})"
-            line["settled, whole"] = f"{whole['settled'].astype(str).eq('True').sum()} of {len(whole)}"
-        lines.append(line)
-    return pd.DataFrame(lines)
+
+    def in_progress(said: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
+        return lambda group: " / ".join(said(each) for _, each in group[group["share"] < 1.0].groupby("share"))
+
+    def of_wholes(said: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
+        return lambda group: said(whole) if len(whole := group[group["share"] == 1.0]) else ""
+
+    def inside(group: pd.DataFrame) -> str:
+        covered = in_progress(lambda each: f"{100.0 * each['covered'].mean():.0f}")
+        return covered(group) if group["covered"].notna().any() else ""
+
+    cells: dict[str, Cell] = {
+        "end at 25 / 50 / 75 %: mean error (%)": in_progress(lambda each: _over_seeds(each, "error_percent")),
+        "worst (%)": in_progress(lambda each: digits(each["error_percent"].abs().max())),
+        "inside 90 % (%)": inside,
+        "whole: q_max off least squares, mean (worst) (%)": of_wholes(
+            lambda whole: f"{_over_seeds(whole, 'q_error_percent')} ({digits(whole['q_error_percent'].abs().max())})"
+        ),
+        "settled, whole": of_wholes(lambda whole: count_of(whole["settled"].astype(str).eq("True"))),
+    }
+    return table_of(rows, ["cell", "method"], cells)
 
 
 def _over_seeds(rows: pd.DataFrame, column: str) -> str:

@@ -32,99 +32,60 @@ from __future__ import annotations
 import ast
 import contextlib
 import itertools
-import json
-import shutil
 import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import pandas as pd
-from filelock import FileLock, Timeout
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from tqdm import tqdm
 
 from battery_env.callbacks import CALIBRATION_CHARTS, CalibrationCallback
-from benchmarks.contests import EVALUATION_EPISODES, contest_of, made_by
-from benchmarks.study import Study, command_line, digits, markdown, natural, positive, write_json, write_text
-from benchmarks.training import DEFAULTS_TIMESTEPS, Recipe, Training, registered_id, set_up
+from benchmarks.contests import EVALUATION_EPISODES, contest_of, recipes_of
+from benchmarks.study import Study, Tables, command_line, markdown, natural, positive
+from benchmarks.training import (
+    DEFAULTS_TIMESTEPS,
+    Recipe,
+    Training,
+    alone,
+    finished_model,
+    made_by,
+    record_file,
+    registered_id,
+    set_up,
+)
 from sb3_lac import DashboardCallback, LyapunovCallback
 from sb3_lac.costs import CostAlgorithm
 
 
-class ProgressCallback(BaseCallback):
+def part(recipe: dict[str, Any], out: Path) -> Tables:
     """
-    A progress bar with the latest score.
-
-    :param label: name of the run
-    :param total: environment steps of the whole run
-    :param calibration: where the score comes from
-    :param position: line of the terminal
+    Train one policy, unless that has been done, and score it. One that was interrupted goes on from its last checkpoint.
     """
-
-    def __init__(self, label: str, total: int, calibration: CalibrationCallback, position: int) -> None:
-        super().__init__()
-        self.label, self.total, self.calibration, self.position = label, total, calibration, position
-
-    def _on_training_start(self) -> None:
-        self.bar = tqdm(desc=self.label, total=self.total, initial=self.num_timesteps, position=self.position, mininterval=1.0)
-
-    def _on_step(self) -> bool:
-        self.bar.update(self.num_timesteps - self.bar.n)
-        if self.calibration.history:
-            objective = self.calibration.objective
-            self.bar.set_postfix_str(f"{objective} {digits(self.calibration.history[-1][objective])}", refresh=False)
-        return True
-
-    def _on_training_end(self) -> None:
-        self.bar.close()
-
-
-def run(recipe: Recipe, out: Path, position: int = 0) -> None:
-    """
-    Train one policy and score it. Does nothing if that has been done, and goes on from the last checkpoint if it was
-    interrupted.
-    """
-    folder = _folder(recipe, out)
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        # freed when its process ends, however it does
-        with FileLock(folder / ".lock", timeout=0):
-            if not (folder / "summary.json").exists():
-                _train(recipe, folder, out, position)
-    except Timeout as error:
-        raise RuntimeError(f"another process is busy with {folder}: wait for it, or choose another --out") from error
-
-
-def _train(recipe: Recipe, folder: Path, out: Path, position: int) -> None:
-    of_env, every = contest_of(recipe.env_id), recipe.evaluation_freq
-    training = Training(recipe, folder / "model.zip", eval_env_kwargs=dict(of_env.options))
-    scored_env = training.evaluation_env()
-    calibration = CalibrationCallback(
-        lambda candidate: of_env.scores(candidate, scored_env, brief=True),
-        eval_freq=every,
-        metrics=of_env.metrics,
-        log_path=folder / "calibration.csv",
-        verbose=0,
-    )
-    callbacks: list[BaseCallback] = [
-        calibration,
-        EvalCallback(training.evaluation_env(), n_eval_episodes=EVALUATION_EPISODES, eval_freq=every, verbose=0),
-        *_dashboard(training),
-        ProgressCallback(f"{of_env.env_id} {recipe.label} seed {recipe.seed}", recipe.timesteps, calibration, position),
-    ]
-    log = out / "tensorboard" / of_env.env_id / f"{recipe.label.replace(' ', '_')}_seed{recipe.seed}_{recipe.digest}"
-    with contextlib.closing(training):
-        made_by = training.run(callbacks, log, ["tensorboard"])
-        training.save()
-
-    scores = of_env.scores(training.model, scored_env)
-    write_text(folder / "scores.csv", scores.to_csv(index=False, float_format="%.6g"))
-    write_json(folder / "summary.json", made_by | of_env.summary(scores))
-    shutil.rmtree(training.checkpoint.folder, ignore_errors=True)
+    made_from = Recipe(**recipe)
+    folder, of_env, every = _folder(made_from, out), contest_of(made_from.env_id), made_from.evaluation_freq
+    curve = folder / f"learning_{made_from.name}.csv"
+    options = {"eval_env_kwargs": dict(of_env.options)}
+    with alone(made_from, folder), contextlib.closing(Training(made_from, folder, **options)) as training:
+        env = training.evaluation_env()
+        if (model := finished_model(made_from, folder)) is None:
+            model = training.model
+            if model.num_timesteps == 0:  # what began and left no checkpoint left no curve
+                curve.unlink(missing_ok=True)
+            callbacks: list[BaseCallback] = [
+                CalibrationCallback(
+                    lambda candidate: of_env.scores(candidate, env, brief=True), every, of_env.metrics, curve, verbose=0
+                ),
+                EvalCallback(training.evaluation_env(), n_eval_episodes=EVALUATION_EPISODES, eval_freq=every, verbose=0),
+                *_dashboard(training),
+            ]
+            log = f"{made_from.label.replace(' ', '_')}_seed{made_from.seed}_{made_from.digest}"
+            training.run(callbacks, out / "tensorboard" / of_env.env_id / log)
+        return {"scores": of_env.scores(model, env), "learning": pd.read_csv(curve)}
 
 
 def _dashboard(training: Training) -> list[BaseCallback]:
@@ -143,31 +104,30 @@ def _folder(recipe: Recipe, out: Path) -> Path:
     return out / registered_id(recipe.env_id) / recipe.name
 
 
-def finished_runs(out: Path) -> pd.DataFrame:
-    """What the finished runs in a folder say, one row per run."""
+def finished_runs(study: Study) -> pd.DataFrame:
+    """What the finished runs in a folder say, one row per run, with its tables."""
     rows = []
-    for file in sorted(out.glob("*/*/summary.json")):
-        try:
-            summary = json.loads(file.read_text(encoding="utf-8"))
-            recipe = Recipe(**summary["recipe"])
-        except (ValueError, TypeError, KeyError) as error:
-            raise ValueError(
-                f"{file} is damaged, or none of this version: delete {file.parent}, or choose another --out"
-            ) from error
-        of_run: dict[str, Any] = {
-            "env": registered_id(recipe.env_id),
-            "algo": recipe.algo,
-            "hyperparameters": recipe.source,
-            "recipe": recipe.digest,
-            "seed": recipe.seed,
-            # an algorithm with roll-outs of fixed length makes more than it is asked for
-            "timesteps": summary.get("timesteps", recipe.timesteps),
-            "label": recipe.label,
-            "folder": file.parent,
-            "scores": summary.get("scores"),
-        }
-        kept = ("updates", "resumed", "training_minutes", "time_per_update_us")
-        rows.append(of_run | {name: summary[name] for name in kept})
+    for arguments, tables in study.done(part):
+        recipe = Recipe(**arguments["recipe"])
+        of_run = made_by(recipe, _folder(recipe, study.out))
+        summary = contest_of(recipe.env_id).summary(tables["scores"])
+        rows.append(
+            {
+                "env": registered_id(recipe.env_id),
+                "algo": recipe.algo,
+                "hyperparameters": recipe.source,
+                "recipe": recipe.digest,
+                "seed": recipe.seed,
+                # an algorithm with roll-outs of fixed length makes more than it is asked for
+                "timesteps": of_run["timesteps"],
+                "label": recipe.label,
+                "scores": summary.get("scores"),
+                **{name: of_run[name] for name in ("updates", "resumed", "training_minutes")},
+                "time_per_update_us": summary["time_per_update_us"],
+                "made_by": of_run,
+                "tables": tables,
+            }
+        )
     if not rows:
         return pd.DataFrame()
     runs = pd.DataFrame(rows)
@@ -179,20 +139,19 @@ def finished_runs(out: Path) -> pd.DataFrame:
 
 def report(study: Study) -> None:
     """Write and show the tables of all finished runs in a folder and, for each environment, its figures with their data."""
-    runs = finished_runs(study.out)
+    runs = finished_runs(study)
     if runs.empty:
         return
     rows: dict[tuple[str, ...], list[dict[str, str]]] = {}  # a table for readers for each set of columns
     tables = []
     for _, of_env in runs.groupby("env"):
-        summary = json.loads((of_env["folder"].iloc[0] / "summary.json").read_text(encoding="utf-8"))
-        lines, table = contest_of(summary["recipe"]["env_id"]).report(of_env, study)
+        lines, table = contest_of(of_env["made_by"].iloc[0]["recipe"]["env_id"]).report(of_env, study)
         tables.append(table)
         for line in lines:
             rows.setdefault(tuple(line), []).append(line)
     together = pd.concat(tables, ignore_index=True)
     if len(together) > 0:
-        study.write_table("compare", together, made_by(runs))
+        study.write_table("compare", together, recipes_of(runs))
     texts = [markdown(lines) for lines in rows.values()]
     resumed = runs[runs["resumed"] > 0]
     if len(resumed) > 0:
@@ -209,7 +168,7 @@ def _check(recipe: Recipe, out: Path) -> None:
     if recipe.algo == "ppo_lstm":
         raise ValueError("ppo_lstm: policies with a memory cannot be scored here")
     contest_of(recipe.env_id)
-    if not (_folder(recipe, out) / "summary.json").exists():
+    if not record_file(recipe, _folder(recipe, out)).exists():
         try:
             with tempfile.TemporaryDirectory() as folder:
                 env = set_up(recipe, Path(folder))[1].env
@@ -266,7 +225,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = {"timesteps": chosen.timesteps, "defaults": chosen.defaults, "evaluations": chosen.evaluations}
     try:
         differing = _differing(chosen.hyperparams)
-        finished_runs(study.out)
         names = {name: name.rpartition(":")[2] for name in (*chosen.envs, *chosen.algos)}
         if unknown := differing.keys() - {"", *names.values()}:
             raise ValueError(f"--hyperparams has some of {', '.join(sorted(unknown))}, which is not compared")
@@ -282,9 +240,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _check(recipe, study.out)
     except (ValueError, FileNotFoundError, gym.error.Error) as error:
         parser.error(str(error))
-    jobs = [recipe for of_seed in recipes for recipe in of_seed]
     try:
-        study.each(run, [(recipe, study.out, 1 + k % chosen.jobs) for k, recipe in enumerate(jobs)])
+        study.run(part, [{"recipe": asdict(recipe)} for of_seed in recipes for recipe in of_seed], out=study.out)
     except Exception:
         try:
             report(study)  # of those that finished

@@ -5,7 +5,6 @@ figures show them.
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -49,6 +48,8 @@ EVALUATION_EPISODES = 20
 _SCORED_EPISODES = 100
 #: Discharges in the test part of a data set of a voltage-only task.
 HELD_OUT = 300
+#: Columns of runs that no table has: what made a run, and its tables.
+OF_RUN = ["made_by", "tables"]
 
 
 def held_out_trajectories(env_id: str) -> TrajectoryDataset:
@@ -97,13 +98,13 @@ class Contest(ABC):
             columns = {name: self.metric, f"{name}_worst": f"{self.metric}_worst"}
             curves: dict[str, list[pd.DataFrame]] = {}
             tables: dict[tuple[str, int], pd.DataFrame] = {}
-            for label, seed, folder in runs[["label", "seed", "folder"]].itertuples(index=False):
-                history = pd.read_csv(folder / "calibration.csv").rename(columns=columns)
+            for label, seed, run in runs[["label", "seed", "tables"]].itertuples(index=False):
+                history = run["learning"].rename(columns=columns)
                 tables[label, seed] = history[["timesteps", *columns.values()]]
                 curves.setdefault(label, []).append(tables[label, seed])
             save_figure(plot_learning_curves(curves, stem, self.metric, self.label), study.out / f"{stem}_learning.png")
             table = pd.concat(tables, names=["algo", "seed"]).droplevel(-1).reset_index()
-            study.write_table(f"{stem}_learning", table, made_by(runs))
+            study.write_table(f"{stem}_learning", table, recipes_of(runs))
 
 
 class Calibration(Contest):
@@ -168,20 +169,19 @@ class FullState(Calibration):
         self.write_learning(runs, study)
         errors = [f"{prefix}{name}_{self.metric}" for prefix in ("", "start_off_") for name in self.parameters]
         of_runs = {
-            (label, seed): pd.read_csv(folder / "scores.csv", usecols=errors)[errors]
-            for label, seed, folder in runs[["label", "seed", "folder"]].itertuples(index=False)
+            (label, seed): run["scores"][errors]
+            for label, seed, run in runs[["label", "seed", "tables"]].itertuples(index=False)
         }
         scores = pd.concat(of_runs, names=["calibrator", "seed", "trajectory"]).reset_index()
-        study.write_table(f"{self.env_id}_scores", scores, made_by(runs))
+        study.write_table(f"{self.env_id}_scores", scores, recipes_of(runs))
         # the paper's figure, of the first seed
         first = runs.drop_duplicates("label")
-        folders = zip(first["label"], first["folder"], strict=True)
-        inferred = {label: pd.read_csv(folder / "scores.csv") for label, folder in folders}
+        inferred = {label: run["scores"] for label, run in zip(first["label"], first["tables"], strict=True)}
         for name, stem in zip(self.parameters, self.stems.values(), strict=True):
             save_figure(plot_true_against_inferred(inferred, name), study.out / f"{stem}_inferred.png")
             columns = ["load", name, f"{name}_hat", f"{name}_spread"]
             points = pd.concat({label: scores[columns] for label, scores in inferred.items()}, names=["algo", "trajectory"])
-            study.write_table(f"{stem}_inferred", points.reset_index(), made_by(runs))
+            study.write_table(f"{stem}_inferred", points.reset_index(), recipes_of(runs))
         table, lines = self.table(runs), []
         for (parameter, label), group in table.groupby(["parameter", "label"], sort=False):
             learned = label != "closed form"
@@ -200,7 +200,7 @@ class FullState(Calibration):
                     **_times(group, learned),
                 }
             )
-        return lines, table.drop(columns=["label", "folder"])
+        return lines, table.drop(columns=["label", *OF_RUN])
 
 
 class VoltageOnly(Calibration):
@@ -228,18 +228,18 @@ class VoltageOnly(Calibration):
 
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
         self.write_learning(runs, study)
-        who = ["label", "seed", "training_minutes", "folder"]
+        who = ["label", "seed", "training_minutes", "tables"]
         tables = [
-            pd.read_csv(folder / "scores.csv").assign(calibrator=label, seed=seed, training_minutes=minutes)
-            for label, seed, minutes, folder in runs[who].itertuples(index=False)
+            run["scores"].assign(calibrator=label, seed=seed, training_minutes=minutes)
+            for label, seed, minutes, run in runs[who].itertuples(index=False)
         ]
         peers = [{"env_id": self.env_id, "calibrator": name} for name in self.peers()]
         scores = pd.concat([*tables, study.run(peer_scores, peers)["scores"]], ignore_index=True)
         order = ["calibrator", "seed", "training_minutes"]
         scores = scores[[*order, *(column for column in scores.columns if column not in order)]]
         table = self.table(scores)
-        study.write_table(f"{self.env_id}_scores", scores, made_by(runs))
-        study.write_table(self.env_id, table, made_by(runs))
+        study.write_table(f"{self.env_id}_scores", scores, recipes_of(runs))
+        study.write_table(self.env_id, table, recipes_of(runs))
         save_figure(plot_ranks(scores, self.parameters), study.out / f"{self.env_id}.png")
         lines = []
         for (sensor, calibrator), group in table.groupby(["sensor", "calibrator"], sort=False):
@@ -301,13 +301,15 @@ class Episodes(Contest):
 
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
         self.write_learning(runs, study)
-        scores = [pd.read_csv(folder / "scores.csv") for folder in runs["folder"]]
+        scores = [run["scores"] for run in runs["tables"]]
         table = runs.assign(
             cost=[of_run["cost"].mean() for of_run in scores],
             cost_worst=[of_run["cost"].max() for of_run in scores],
             length=[of_run["length"].mean() for of_run in scores],
         )
-        study.write_table(self.env_id, table.drop(columns=["scores", "label", "folder", "time_per_update_us"]), made_by(runs))
+        study.write_table(
+            self.env_id, table.drop(columns=["scores", "label", *OF_RUN, "time_per_update_us"]), recipes_of(runs)
+        )
         lines = [
             {
                 "environment": self.env_id,
@@ -372,12 +374,11 @@ def plot_ranks(scores: pd.DataFrame, parameters: Sequence[str]) -> Figure:
     return figure
 
 
-def made_by(runs: pd.DataFrame) -> dict[str, Any]:
+def recipes_of(runs: pd.DataFrame) -> dict[str, Any]:
     """What made the runs of a table."""
     recipes: dict[str, Any] = {}
-    for recipe_digest, folder in zip(runs["recipe"], runs["folder"], strict=True):
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        recipe = summary["recipe"]
-        seed = {"seed": recipe.pop("seed"), "resumed": summary["resumed"], "versions": summary["versions"]}
-        recipes.setdefault(recipe_digest, {**recipe, "runs": []})["runs"].append(seed)
+    for digest, of_run in zip(runs["recipe"], runs["made_by"], strict=True):
+        recipe = dict(of_run["recipe"])
+        seed = {"seed": recipe.pop("seed"), "resumed": of_run["resumed"], "versions": of_run["versions"]}
+        recipes.setdefault(digest, {**recipe, "runs": []})["runs"].append(seed)
     return {"recipes": recipes}

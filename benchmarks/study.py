@@ -293,21 +293,29 @@ class Study:
             # a text that is empty comes back as one
             texts = {name: table.select_dtypes(exclude=["number", "bool"]).columns for name, table in written.items()}
             return {name: table.fillna(dict.fromkeys(texts[name], "")) for name, table in written.items()}
-        module = Path(inspect.getfile(part)).read_text(encoding="utf-8")
-        files = []
-        for arguments in parts:
-            made_from = {"part": part.__name__, "arguments": arguments, "module": module, "versions": own_versions()}
-            files.append(self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json")
-        missing = {file: dict(arguments) for file, arguments in zip(files, parts, strict=True) if not _tables_of(file)}
+        files = [self._file_of(part, arguments) for arguments in parts]
+        missing = {file: dict(arguments) for file, arguments in zip(files, parts, strict=True) if recall(file) is None}
         where = list(missing)
         runs = [(partial(importable(part), **places), arguments) for arguments in missing.values()]
         self.each(_make, runs, lambda number, content: write_json(where[number], content))
-        made = [_tables_of(file) for file in files]
+        made = [_tables_of(recall(file)) for file in files]
         names = dict.fromkeys(name for tables in made for name in tables)
-        return {
-            name: pd.concat([pd.DataFrame(tables[name]) for tables in made if name in tables], ignore_index=True)
-            for name in names
-        }
+        return {name: pd.concat([tables[name] for tables in made if name in tables], ignore_index=True) for name in names}
+
+    def done(self, part: Callable[..., Tables]) -> list[tuple[dict[str, Any], Tables]]:
+        """The arguments and the tables of all parts that lie in ``<out>/parts``, whichever command made them."""
+        kept = {file: recall(file) for file in sorted((self.out / "parts").glob(f"{part.__name__}_*.json"))}
+        return [
+            (content["arguments"], _tables_of(content))
+            for file, content in kept.items()
+            if content and file == self._file_of(part, content["arguments"])  # not of another version
+        ]
+
+    def _file_of(self, part: Callable[..., Tables], arguments: Mapping[str, Any]) -> Path:
+        """The file that stands for a part."""
+        module = Path(inspect.getfile(part)).read_text(encoding="utf-8")
+        made_from = {"part": part.__name__, "arguments": arguments, "module": module, "versions": own_versions()}
+        return self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json"
 
     def each(
         self,
@@ -389,15 +397,24 @@ def importable(function: Callable[..., Result]) -> Callable[..., Result]:
     return getattr(importlib.import_module(program.name), function.__name__)
 
 
-def _tables_of(file: Path) -> dict[str, Any]:
-    """The tables of a part; none if it is not made. A damaged file is set aside, and its part is made again."""
+def recall(file: Path) -> dict[str, Any] | None:
+    """
+    What a file says of something that is done, which is written last; None if there is none. A damaged one is set aside, and
+    what it stood for is made again.
+    """
     if not file.exists():
-        return {}
+        return None
     try:
-        return dict(json.loads(file.read_text(encoding="utf-8"))["tables"])
+        content = json.loads(file.read_text(encoding="utf-8"))
+        return {**content, "versions": content["versions"]}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         print(f"{file} is damaged ({error!r}): it is kept as {set_aside(file).name}, and made again", file=sys.stderr)
-        return {}
+        return None
+
+
+def _tables_of(content: Mapping[str, Any] | None) -> dict[str, pd.DataFrame]:
+    assert content is not None
+    return {name: pd.DataFrame(table) for name, table in content["tables"].items()}
 
 
 def _make(part: Callable[..., Tables], arguments: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from hashlib import sha256
@@ -24,6 +24,7 @@ from typing import Any
 import gymnasium as gym
 import torch as th
 import yaml
+from filelock import FileLock, Timeout
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -32,7 +33,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from battery_env.files import replacing
-from benchmarks.study import digest_of, own_versions, versions, write_json, write_text
+from benchmarks.study import digest_of, own_versions, recall, versions, write_json, write_text
 from sb3_lac.discounts import DEFAULT_DISCOUNT
 from sb3_lac.zoo import LACExperimentManager, find_config
 
@@ -265,29 +266,36 @@ class Training:
     One training, ready to begin or, where the recipe has evaluations, to go on from the checkpoint at the last of them.
 
     :param recipe: what it is made by
-    :param file: where the model is saved, in a folder of its own if the recipe has evaluations
+    :param folder: where the model is saved, and beside it what made it
     :param options: of the manager of the RL Zoo
     """
 
-    def __init__(self, recipe: Recipe, file: Path, **options: Any) -> None:
-        self.recipe, self.file = recipe, file
-        self.checkpoint = CheckpointCallback(file.with_name("checkpoint"), recipe.evaluation_freq)
+    def __init__(self, recipe: Recipe, folder: Path, **options: Any) -> None:
+        self.recipe, self.folder = recipe, folder
+        self.checkpoint = CheckpointCallback(folder / f"checkpoint_{recipe.name}", recipe.evaluation_freq)
         if self.checkpoint.resumed:
             options["trained_agent"] = str(self.checkpoint.folder / "model.zip")
-        self.manager, self.model = set_up(recipe, file.parent / "zoo", **options)
+        self.manager, self.model = set_up(recipe, folder / "zoo", **options)
 
     def evaluation_env(self) -> VecEnv:
         """One more environment."""
         with contextlib.redirect_stdout(io.StringIO()):
             return self.manager.create_envs(n_envs=1, eval_env=True, no_log=True)
 
-    def run(self, callbacks: Sequence[BaseCallback], log: Path, formats: Sequence[str]) -> dict[str, Any]:
-        """Train, and return what made the model."""
-        model = self.model
-        model.set_logger(configure(str(log), list(formats)))
+    def run(self, callbacks: Sequence[BaseCallback], log: Path | None = None) -> None:
+        """
+        Train, and save the model and what made it.
+
+        :param callbacks: of the training
+        :param log: folder for TensorBoard; that of the model by default, with a table beside it
+        """
+        model, record = self.model, record_file(self.recipe, self.folder)
+        model.set_logger(configure(str(log or self.folder), ["tensorboard"] if log else ["csv", "tensorboard"]))
         steps = self.recipe.timesteps - model.num_timesteps
         model.learn(steps, [*callbacks, self.checkpoint], reset_num_timesteps=False)
-        return {
+        with replacing(record.with_suffix(".zip")) as part:
+            model.save(part)
+        made_by = {
             "recipe": asdict(self.recipe),
             "versions": versions(),
             "resumed": self.checkpoint.resumed,
@@ -296,17 +304,22 @@ class Training:
             "timesteps": model.num_timesteps,
             "training_minutes": self.checkpoint.seconds / 60.0,
         }
-
-    def save(self) -> None:
-        """Save the model."""
-        with replacing(self.file) as part:
-            self.model.save(part)
+        write_json(record, made_by)
+        shutil.rmtree(self.checkpoint.folder, ignore_errors=True)
 
     def close(self) -> None:
         """Close the environments of the model and its log, however the training went."""
         assert self.model.env is not None
         self.model.env.close()
         self.model.logger.close()
+
+
+def finished_model(recipe: Recipe, folder: Path) -> BaseAlgorithm | None:
+    """The model of a training that is done."""
+    record = record_file(recipe, folder)
+    if recall(record) is None or not record.with_suffix(".zip").exists():
+        return None
+    return algorithm(recipe.algo).load(record.with_suffix(".zip"), device="cpu")
 
 
 def train_or_load(
@@ -316,19 +329,38 @@ def train_or_load(
     Train one policy, or load it if that has been done. Callbacks that change nothing, and whether updates are compiled, are no
     part of the recipe.
     """
-    record = record_file(recipe, folder)
-    file = record.with_suffix(".zip")
-    if not file.exists():
-        hyperparams = {"compile_update": True} if compile_update else {}
-        with contextlib.closing(Training(recipe, file, hyperparams=hyperparams)) as training:
-            write_json(record, training.run(callbacks, folder, ["csv", "tensorboard"]))
-            training.save()
-    return ALGOS[recipe.algo].load(file, device="cpu")
+    with alone(recipe, folder):
+        model = finished_model(recipe, folder)
+        if model is None:
+            options = {"hyperparams": {"compile_update": True}} if compile_update else {}
+            with contextlib.closing(Training(recipe, folder, **options)) as training:
+                training.run(callbacks)
+            model = finished_model(recipe, folder)
+    assert model is not None
+    return model
+
+
+@contextlib.contextmanager
+def alone(recipe: Recipe, folder: Path) -> Iterator[None]:
+    """Refuse a training that another process is busy with; that it is no more is known when it ends, however it does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / f".{recipe.name}.lock", timeout=0):
+            yield
+    except Timeout as error:
+        raise RuntimeError(f"another process is busy with {folder}: wait for it, or choose another --out") from error
 
 
 def training_minutes(recipe: Recipe, folder: Path) -> float:
     """How long :func:`train_or_load` took to train a model."""
-    return float(json.loads(record_file(recipe, folder).read_text(encoding="utf-8"))["training_minutes"])
+    return float(made_by(recipe, folder)["training_minutes"])
+
+
+def made_by(recipe: Recipe, folder: Path) -> dict[str, Any]:
+    """What made a model that is there."""
+    record = recall(record_file(recipe, folder))
+    assert record is not None
+    return record
 
 
 def record_file(recipe: Recipe, folder: Path) -> Path:

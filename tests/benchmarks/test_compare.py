@@ -2,6 +2,7 @@
 
 import json
 import re
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch as th
-from filelock import FileLock
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -17,7 +17,8 @@ from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 
 from battery_env import ClosedForm, evaluate
 from benchmarks import compare, contests
-from benchmarks.training import Recipe
+from benchmarks.study import write_json
+from benchmarks.training import Recipe, finished_model, made_by, record_file
 
 ENV_ID = "BatteryRo-v0"
 ROOT = Path(__file__).parents[2]
@@ -85,7 +86,7 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     logs = {path.parent.name for path in (out / "tensorboard" / ENV_ID).rglob("events*")}
     assert logs == {f"{algo.upper()}_seed0_{recipe(algo).digest}" for algo in ("lac", "sac", "td3")}
     assert {path.name for path in (out / ENV_ID).iterdir()} == {recipe(algo).name for algo in ("lac", "sac", "td3")}
-    assert not list(out.rglob("checkpoint"))
+    assert not list(out.rglob("checkpoint*"))
 
     for log in (out / "tensorboard" / ENV_ID).iterdir():
         shows_in_tensorboard(log, lyapunov=log.name.startswith("LAC"))
@@ -122,23 +123,18 @@ def finished(monkeypatch):
     """The recipes of runs that only leave what a training would have left."""
     trained = []
 
-    def run(recipe, out, position=0):
-        folder = out / recipe.env_id / recipe.name
-        if (folder / "summary.json").exists():
-            return
-        trained.append(recipe)
-        folder.mkdir(parents=True)
-        data = contests.held_out_trajectories(recipe.env_id)
-        scores = evaluate(ClosedForm(), data)
+    def part(recipe, out):
+        chosen = Recipe(**recipe)
+        trained.append(chosen)
+        record = {"recipe": recipe, "versions": {"torch": "2"}, "resumed": 2 * chosen.seed, "updates": 3}
+        record |= {"timesteps": chosen.timesteps, "training_minutes": 0.5}
+        write_json(record_file(chosen, out / chosen.env_id / chosen.name), record)
+        scores = evaluate(ClosedForm(), contests.held_out_trajectories(chosen.env_id))
         scores["start_off_r_o_mape_percent"] = scores["r_o_mape_percent"]
-        scores.to_csv(folder / "scores.csv", index=False)
-        history = {"timesteps": [recipe.timesteps], "mape_percent": [1.0], "mape_percent_worst": [2.0]}
-        pd.DataFrame(history).to_csv(folder / "calibration.csv", index=False)
-        summary = {"recipe": asdict(recipe), "versions": {"torch": "2"}, "resumed": 2 * recipe.seed, "updates": 3}
-        summary |= {"training_minutes": 0.5, **contests.FullState(recipe.env_id).summary(scores)}
-        (folder / "summary.json").write_text(json.dumps(summary))
+        history = {"timesteps": [chosen.timesteps], "mape_percent": [1.0], "mape_percent_worst": [2.0]}
+        return {"scores": scores, "learning": pd.DataFrame(history)}
 
-    monkeypatch.setattr(compare, "run", run)
+    monkeypatch.setattr(compare, "part", part)
     # drawn by another test
     for name in ("plot_true_against_inferred", "plot_learning_curves", "save_figure"):
         monkeypatch.setattr(contests, name, lambda *args: None)
@@ -197,7 +193,7 @@ def test_defaults_are_the_line_as_typed(algo, tmp_path, monkeypatch):
     )
     chosen = recipe(algo, timesteps=150, evaluations=1, defaults=True)
     assert chosen.name.startswith(f"{algo}_defaults_seed0_")
-    compare.run(chosen, tmp_path)
+    compare.part(asdict(chosen), tmp_path)
     typed = ALGOS[algo]("MlpPolicy", ENV_ID, seed=0, device="cpu").learn(150)
     assert typed._n_updates == captured[-1]._n_updates == 50
     for ours, expected in zip(captured[-1].policy.parameters(), typed.policy.parameters(), strict=True):
@@ -205,43 +201,35 @@ def test_defaults_are_the_line_as_typed(algo, tmp_path, monkeypatch):
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint_and_says_so(tmp_path, monkeypatch):
+    started_at = []
+
     class Interrupt(BaseCallback):
         def __init__(self, at):
             super().__init__()
             self.at = at
 
+        def _on_training_start(self):
+            started_at.append(self.num_timesteps)
+
         def _on_step(self):
-            if self.num_timesteps in self.at:
+            if self.num_timesteps == self.at:
                 raise KeyboardInterrupt
             return True
 
-    started_at = []
-
-    class Progress(compare.ProgressCallback):
-        def _on_training_start(self):
-            started_at.append(self.num_timesteps)
-            super()._on_training_start()
-
-    monkeypatch.setattr(compare, "ProgressCallback", Progress)
     chosen = recipe(evaluations=4)
-    # the first interruption is before the first checkpoint: what follows is a run from the start
-    for at in (60, 240, 340):
-        with monkeypatch.context() as patch:
-            patch.setattr(compare, "EvalCallback", lambda *args, at=at, **kwargs: Interrupt([at]))
-            with pytest.raises(KeyboardInterrupt):
-                compare.run(chosen, tmp_path)
     folder = tmp_path / ENV_ID / chosen.name
-    assert (folder / "checkpoint" / "model.zip").exists() and not (folder / "summary.json").exists()
-    compare.run(chosen, tmp_path)
+    # the first interruption is before the first checkpoint: what follows is a run from the start
+    for at in (60, 240, 340, None):
+        with monkeypatch.context() as patch:
+            patch.setattr(compare, "EvalCallback", lambda *args, at=at, **kwargs: Interrupt(at))
+            with nullcontext() if at is None else pytest.raises(KeyboardInterrupt):
+                found = compare.part(asdict(chosen), tmp_path)
+        assert finished_model(chosen, folder) is None or at is None
     assert started_at == [0, 0, 200, 300]
-    assert list(pd.read_csv(folder / "calibration.csv")["timesteps"]) == [100, 200, 300, 400]
-    summary = json.loads((folder / "summary.json").read_text())
-    assert summary["recipe"]["timesteps"] == 400 and summary["updates"] > 0 and summary["training_minutes"] > 0
-    assert summary["resumed"] == 2
-
-    # an unfinished run of another recipe is another one
-    compare.run(recipe(evaluations=1), tmp_path)
-    assert started_at[-1] == 0
+    assert list(found["learning"]["timesteps"]) == [100, 200, 300, 400]
+    record = made_by(chosen, folder)
+    assert record["timesteps"] == 400 and record["updates"] > 0 and record["training_minutes"] > 0
+    assert record["resumed"] == 2 and Recipe(**record["recipe"]) == chosen
 
 
 VOLTAGE_CONFIG = """
@@ -271,8 +259,8 @@ def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_pa
     assert json.loads((out / "BatteryVoltageJoint-v0.json").read_text())["configuration"]["recipes"]
     for figure in ("", "_r_o_learning"):
         assert (out / f"BatteryVoltageJoint-v0{figure}.png").stat().st_size > 0
-    times = {path: path.stat().st_mtime_ns for path in [*out.rglob("model.zip"), *out.rglob("parts/*")]}
-    assert len(times) == 4
+    times = {path: path.stat().st_mtime_ns for path in [*out.rglob("model_*.zip"), *out.rglob("parts/*")]}
+    assert len(times) == 6
     compare.main(chosen)
     assert {path: path.stat().st_mtime_ns for path in times} == times
 
@@ -327,25 +315,15 @@ def test_nonsense_on_the_command_line_is_refused_before_any_training(wrong, mess
     assert finished == []
 
 
-@pytest.mark.parametrize("damaged", ["", "[]", "{}", '{"recipe": ', '{"recipe": 5}', '{"recipe": {"algo": "lac"}}'])
-def test_a_damaged_summary_is_named(tmp_path, capsys, finished, damaged):
-    compare.main(command("--algos", "lac"))
-    (file,) = (tmp_path / "out").glob("*/*/summary.json")
-    file.write_text(damaged)
-    with pytest.raises(SystemExit):
-        compare.main(command("--algos", "lac"))
-    assert f"{file.name} is damaged, or none of this version: delete" in capsys.readouterr().err
-
-
 def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatch, capsys):
-    finish = compare.run
+    finish = compare.part
 
-    def run(recipe, out, position):
-        if recipe.algo == "sac":
+    def part(recipe, out):
+        if recipe["algo"] == "sac":
             raise ZeroDivisionError
-        finish(recipe, out, position)
+        return finish(recipe, out)
 
-    monkeypatch.setattr(compare, "run", run)
+    monkeypatch.setattr(compare, "part", part)
     with pytest.raises(ZeroDivisionError):
         compare.main(command("--algos", "sac"))
     assert not (tmp_path / "out" / "compare.csv").exists()
@@ -360,12 +338,3 @@ def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatc
     with pytest.raises(ZeroDivisionError):
         compare.main(command("--algos", "sac", "td3"))
     assert "the tables of what finished failed: ValueError('no tables')" in capsys.readouterr().err
-
-
-def test_two_processes_do_not_train_the_same_run(tmp_path):
-    chosen = recipe()
-    folder = tmp_path / ENV_ID / chosen.name
-    folder.mkdir(parents=True)
-    with FileLock(folder / ".lock"), pytest.raises(RuntimeError, match="another process is busy with"):
-        compare.run(chosen, tmp_path)
-    assert not (folder / "zoo").exists()

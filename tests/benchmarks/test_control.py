@@ -2,6 +2,7 @@
 
 import json
 import re
+from argparse import Namespace
 from functools import partial
 
 import gymnasium as gym
@@ -175,12 +176,12 @@ def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys
     assert all((tmp_path / name).stat().st_size > 1000 for name in ("costs.png", "disturbances.png", "learning.png"))
 
 
-def test_without_a_number_of_steps_it_is_that_of_the_zoo(tmp_path, quick):
-    command = ["--envs", "LinearCost-v0", "--algos", "sac", "metric_sac", "--seeds", "0", "--episodes", "2", "--jobs", "1"]
-    stabilisation.main([*command, "--certificate-episodes", "25", "--out", str(tmp_path)])
-    algos = ("sac", "benchmarks.metric_sac:MetricSAC")
-    assert quick[1] == [(algo, "LinearCost-v0", 0, 60_000) for algo in algos]
-    assert set(pd.read_csv(tmp_path / "learning.csv")["policy"]) == {"SAC", "SAC, LAC's metric", "reference"}
+def test_without_a_number_of_steps_it_is_that_of_the_zoo():
+    chosen = Namespace(envs=["LinearCost-v0"], algos=["sac", "metric_sac"], seeds=[0])
+    reference, *parts = stabilisation.parts_of(
+        chosen, lambda policy, env_id: stabilisation.CONTENDERS[policy], lambda env_id: None
+    )
+    assert reference["timesteps"] is None and [each["timesteps"] for each in parts] == [60_000, 60_000]
 
 
 def test_settings_that_change_during_a_study_are_refused(tmp_path):

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from filelock import FileLock
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 from benchmarks import training
@@ -88,7 +89,7 @@ def test_a_policy_is_trained_once(tmp_path, trainings):
 def test_a_policy_that_would_lose_its_normalization_is_refused(tmp_path):
     with pytest.raises(ValueError, match="policies with `normalize` cannot be scored here"):
         train(2000, tmp_path / "models", hyperparameters={"normalize": True})
-    assert not (tmp_path / "models").exists()
+    assert not list((tmp_path / "models").glob("model_*"))
 
 
 def test_the_seed_decides_everything(tmp_path):
@@ -190,6 +191,22 @@ def test_an_interrupted_training_leaves_no_model(tmp_path, monkeypatch, training
             train(40, tmp_path / "run")
     assert not list((tmp_path / "run").glob("*.zip"))
     assert train(40, tmp_path / "run").num_timesteps == 40 and trainings == [0, 0]
+
+
+@pytest.mark.parametrize("damaged", ["", "[]", "{}", '{"recipe": '])
+def test_a_training_whose_record_is_damaged_is_made_again(damaged, tmp_path, trainings, capsys):
+    train(25, tmp_path)
+    (record,) = tmp_path.glob("model_*.json")
+    record.write_text(damaged)
+    train(25, tmp_path)
+    assert trainings == [0, 0] and f"{record} is damaged" in capsys.readouterr().err
+
+
+def test_two_processes_do_not_train_the_same_policy(tmp_path, trainings):
+    recipe = training.Recipe.of("lac", ENV_ID, 0, 25)
+    with FileLock(tmp_path / f".{recipe.name}.lock"), pytest.raises(RuntimeError, match="another process is busy with"):
+        train(25, tmp_path)
+    assert trainings == []
 
 
 @pytest.mark.parametrize("study", ["compare", "compare_defaults"])
