@@ -6,6 +6,7 @@ costs, whether it ends at the goal, what disturbances that it was not trained fo
 
   python -m benchmarks.stabilisation --timesteps 16000 --seeds 0 1 2
   python -m benchmarks.stabilisation --algos lac published_lac sac td3 tqc metric_sac --compile
+  python -m benchmarks.stabilisation --algos    # the reference controllers alone
 
 Policies are trained without disturbances, with the hyperparameters of ``zoo_configs``, and judged by their mean action. All of
 them have the same starts and disturbances. ``sac_common``, ``td3_common`` and ``tqc_common`` have the one setting of LAC for
@@ -407,7 +408,7 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("stabilisation", __doc__)
-    parser.add_argument("--algos", nargs="+", default=["lac", "sac", "td3"], choices=list(CONTENDERS))
+    parser.add_argument("--algos", nargs="*", default=["lac", "sac", "td3"], choices=list(CONTENDERS))
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     parser.add_argument(

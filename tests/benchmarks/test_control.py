@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 pytest.importorskip("rl_zoo3")
 
-from benchmarks import certificate, control, linear_cost, references, stabilisation
+from benchmarks import certificate, control, linear_cost, stabilisation
 from docs.environment_pages import DOCS, environment_page
 from sb3_lac import LAC
 from sb3_lac.envs import LinearCostEnv
@@ -85,18 +85,6 @@ def test_only_some_loops_end_at_the_goal(env_id):
     # half the gain still reaches the goal in some, and 15 % of it in the linear one
     at_goal.pop("weak")
     assert at_goal and max(at_goal.values()) <= 0.2
-
-
-def test_references_are_tried_and_shown(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(references, "DISTURBANCES", {env_id: control.DISTURBANCES[env_id] for env_id in IDS[:1]})
-    references.main(["--episodes", "3", "--jobs", "1", "--out", str(tmp_path)])
-    table = pd.read_csv(tmp_path / "references.csv")
-    assert len(table) == 6 and json.loads((tmp_path / "references.json").read_text())["configuration"] == {"episodes": 3}
-    assert table.loc[table["disturbance"] == "none", ["at_goal", "died"]].to_numpy().tolist() == [[1, 0]]
-    assert (table["cost"] <= table["cost_worst"]).all() and (table["error_median"] <= table["error_worst"]).all()
-    text = (tmp_path / "references.md").read_text()
-    assert text.count("\n") == 8 and "observation_noise=0.1" in text and text in capsys.readouterr().out
-    assert (tmp_path / "references.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize("env_id", IDS)

@@ -13,7 +13,6 @@ from benchmarks import (
     direct_mapping,
     linear_cost,
     published,
-    references,
     stabilisation,
     throughput,
 )
@@ -44,7 +43,6 @@ REPORTS = {
     "linear_cost/linear_cost": partial(of_one, linear_cost.report, "linear_cost"),
     "published/published": partial(of_one, published.report, "published"),
     "published_horizons/published": partial(of_one, published.report, "published"),
-    "references/references": lambda tables: references.report(tables["references"].fillna({"arguments": ""})),
     "stabilisation/stabilisation": stabilisation.report,
     "stabilisation_long/stabilisation": stabilisation.report,
     "throughput/filters": partial(of_one, throughput.report_filters, "filters"),
