@@ -13,9 +13,8 @@ import os
 import platform
 import shlex
 import sys
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from concurrent.futures import as_completed
 from contextlib import closing
 from functools import partial
 from hashlib import sha256
@@ -33,7 +32,7 @@ import battery_env
 import sb3_lac
 from battery_env.evaluation import over_seeds
 from battery_env.files import check_folder, replacing, set_aside
-from battery_env.lab.workers import Processes, interruptible, workers
+from battery_env.lab.batch import interruptible, workers
 from battery_env.plotting import new_figure, save_figure
 
 Result = TypeVar("Result")
@@ -357,19 +356,9 @@ class Study:
             yield from ((number, partial(function, *run)) for number, run in enumerate(runs))
         elif runs:
             with workers(self.chosen.jobs, self.scheduler) as executor:
-                # A process that is lost takes with it all that is under way in others: no more than they can work at
-                most = self.chosen.jobs if isinstance(executor, Processes) else len(runs)
-                waiting, started = deque(enumerate(runs)), dict[Future[Result], int]()
-                while waiting or started:
-                    while waiting and len(started) < most:
-                        number, run = waiting.popleft()
-                        started[executor.submit(importable(function), *run)] = number
-                    for future in wait(started, return_when=FIRST_COMPLETED).done:
-                        number = started.pop(future)
-                        if isinstance(executor, Processes) and isinstance(future.exception(), BrokenExecutor):
-                            yield number, partial(executor.alone, importable(function), *runs[number])
-                        else:
-                            yield number, future.result
+                started = {executor.submit(importable(function), *run): number for number, run in enumerate(runs)}
+                for future in as_completed(started):
+                    yield started[future], future.result
 
     def write_table(self, name: str, table: pd.DataFrame, configuration: Mapping[str, Any] | None = None) -> None:
         """Write a table as CSV, and beside it as JSON what made it: command, configuration, versions."""

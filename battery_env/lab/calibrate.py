@@ -106,8 +106,8 @@ def calibrate(
     return each_usable(lambda each: calibrated(each, settings), source, file_format)
 
 
-class _Seen(NamedTuple):
-    """What a record shows before the model is fitted to it."""
+class _LoadedPart(NamedTuple):
+    """The part of a discharge under load, before the model is fitted to it."""
 
     discharge: Discharge  # all of it
     loaded: Discharge
@@ -120,13 +120,12 @@ class _Seen(NamedTuple):
     cell: CellParameters
     start: Start
     load: ExpectedCurrent
-    future: ExpectedCurrent
 
 
 class Ahead(NamedTuple):
     """What is asked of the time after a record."""
 
-    load: LoadToCome | None = None  # to come; ``None``: as the settings say
+    load: LoadToCome | None = None  # to come; ``None``: as so far
     samples: int = 1000  # of what may come
     is_asked: bool = False  # whether an end that cannot be told is an error, and not only unknown
 
@@ -138,17 +137,17 @@ def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON
     """What one discharge says, and of one in progress what comes after it."""
     is_whole = not np.isnan(discharge.eod_time_s(settings.cut_off_V))
     known = settings if is_whole else settings.with_nominal_prior()
-    seen = _look_at(discharge, known)
-    estimate, method, model, now = _estimate(seen, known, ahead.load)
+    part = _look_at(discharge, known)
+    estimate, method, model, now = _estimate(part, known, ahead.load)
     # a cell in progress has not ended, however low its model comes in the pulses before
-    limits = (-np.inf, 0.0) if seen.in_progress else (settings.cut_off_V, seen.future.mean_A)
-    shown = model.forecast(seen.record, estimate, *limits)
-    end = _end(seen, estimate, replace(known, method=method), now or model, shown, ahead)
-    end_C, model_end_C = _end_temperatures(seen.record, shown)
-    charge = _charge(seen, settings, estimate, end)
-    if seen.start.reason or seen.more_C or not _is_all_logged(seen, shown, estimate):
+    cut_off_V, current_A = (-np.inf, 0.0) if part.in_progress else (settings.cut_off_V, part.load.mean_A)
+    shown = model.forecast(part.record, estimate, cut_off_V, current_A)
+    end = _end(part, estimate, replace(known, method=method), now or model, shown, ahead)
+    end_C, model_end_C = _end_temperatures(part.record, shown)
+    charge = _charge(part, settings, estimate, end)
+    if part.start.reason or part.more_C or not _is_all_logged(part, shown, estimate):
         charge = dict.fromkeys(charge, float("nan"))
-    nominal_Ah = _nominal_Ah(model, settings, seen.future.mean_A if seen.in_progress else seen.load.mean_A)
+    nominal_Ah = _nominal_Ah(model, settings, part.load.mean_A)
     eod_s, sd_eod_s = (shown.eod_time_s, float("nan")) if end is None else _middle(end.eod_time_s, estimate)
     return Calibration(
         cycle=discharge.meta.get("cycle"),
@@ -161,34 +160,34 @@ def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON
         settled_q_mobile=estimate.settled_q_mobile,
         settled_r_o=estimate.settled_r_o,
         reason=estimate.reason,
-        initial_soc=seen.start.soc,
-        sd_initial_soc=seen.start.sd_soc,
-        samples=len(seen.loaded.time_s),
-        averaged_over_s=seen.averaged_over_s,
-        load_on_time_s=float(seen.record.time_s[0]),
-        drawn_Ah=seen.loaded.charge_C / 3600.0,
+        initial_soc=part.start.soc,
+        sd_initial_soc=part.start.sd_soc,
+        samples=len(part.loaded.time_s),
+        averaged_over_s=part.averaged_over_s,
+        load_on_time_s=float(part.record.time_s[0]),
+        drawn_Ah=part.loaded.charge_C / 3600.0,
         **charge,
         nominal_Ah=nominal_Ah,
         state_of_health=charge["predicted_capacity_Ah"] / nominal_Ah,
         sd_state_of_health=charge["sd_predicted_capacity_Ah"] / nominal_Ah,
-        voltage_rmse_V=_rmse_V(shown, seen.record),
+        voltage_rmse_V=_rmse_V(shown, part.record),
         predicted_eod_time_s=eod_s,
         sd_predicted_eod_time_s=sd_eod_s,
-        measured_eod_time_s=seen.eod_time_s,
-        remaining_s=eod_s - float(seen.record.time_s[-1]) if seen.in_progress else 0.0,
-        future_current_A=seen.future.mean_A,
-        load_varied=seen.future.varied,
+        measured_eod_time_s=part.eod_time_s,
+        remaining_s=eod_s - float(part.record.time_s[-1]) if part.in_progress else 0.0,
+        future_current_A=part.load.mean_A,
+        load_varied=part.load.varied,
         ambient_C=model.cell.Tb0 - ZERO_CELSIUS_K,
         end_temperature_C=end_C,
         model_end_temperature_C=model_end_C,
         settings=settings,
-        record=seen.record,
+        record=part.record,
         forecast=shown,
         end=end,
     )
 
 
-def _look_at(discharge: Discharge, settings: Settings) -> _Seen:
+def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
     """The part under load, how it starts, and what comes after it."""
     loaded, eod_time_s = discharge.loaded_part(settings.cut_off_V), discharge.eod_time_s(settings.cut_off_V)
     more_C = _charge_after(discharge, loaded, eod_time_s, settings.cut_off_V)
@@ -204,55 +203,66 @@ def _look_at(discharge: Discharge, settings: Settings) -> _Seen:
         start = soc_from_rest(discharge, cell, settings.mismatch_V)
     else:
         start = Start(*check_initial_soc(settings.initial_soc))
-    load, stated_A = expected_current(record.time_s, record.current_A), settings.future_current_A
-    future = load if stated_A is None else ExpectedCurrent(stated_A, varied=False, sd_A=0.0)
-    in_progress = bool(np.isnan(eod_time_s))
-    return _Seen(discharge, loaded, record, fitted, over_s, eod_time_s, in_progress, more_C, cell, start, load, future)
+    return _LoadedPart(
+        discharge=discharge,
+        loaded=loaded,
+        record=record,
+        fitted=fitted,
+        averaged_over_s=over_s,
+        eod_time_s=eod_time_s,
+        in_progress=bool(np.isnan(eod_time_s)),
+        more_C=more_C,
+        cell=cell,
+        start=start,
+        load=expected_current(record.time_s, record.current_A),
+    )
+
+
+def _goes_on(part: _LoadedPart, load: LoadToCome | None) -> bool:
+    """Whether a record is in progress at a constant load, as far as is known for ever."""
+    is_over = float(part.discharge.time_s[-1] - part.loaded.time_s[-1]) > _REST_S
+    return part.in_progress and load is None and not part.load.varied and not is_over
 
 
 def _estimate(
-    seen: _Seen, settings: Settings, load: LoadToCome | None
+    part: _LoadedPart, settings: Settings, load: LoadToCome | None
 ) -> tuple[Estimate, Method, RecordModel, ModelNow | None]:
-    """
-    The estimate of the first method that settles the discharge, or of the last one; which it is; the model that it is of; and
-    of the filter where this stands.
-    """
-    methods: list[Method] = [settings.method or "least-squares"]
+    """The estimate, the method, the model that it is of, and of the filter where this stands at the end of the record."""
+    goes_on, is_new = _goes_on(part, load), settings.prior_q_mobile_C is None and settings.cell is None
     # under other loads the filter, which takes the error of the model for noise, is surer than it may be
-    is_over = float(seen.discharge.time_s[-1] - seen.loaded.time_s[-1]) > STEADY_S
-    goes_on = settings.future_current_A is None and load is None and not seen.load.varied and not is_over
-    is_new = settings.prior_q_mobile_C is None and settings.cell is None
-    if settings.method is None and seen.in_progress and goes_on and is_new:
-        methods.append("kalman")
-    for method in methods:
-        calibrator = replace(settings, method=method).calibrator(seen.cell, seen.start)
-        cell, thermal, now = seen.cell, settings.thermal, None
-        if isinstance(calibrator, ExtendedKalmanFilter):
-            estimate, now = last_estimate(calibrator.follow(seen.fitted)), calibrator.now() if goes_on else None
-        else:
-            estimate = calibrator.estimate(seen.fitted)
-        if isinstance(calibrator, PolicyEstimator):
-            cell, thermal = calibrator.cell, False
-        if estimate.settled:
-            break
-    if reason := seen.start.reason or settings.other_load(mean_current_A(seen.record)):
-        estimate = replace(estimate, settled_q_mobile=False, settled_r_o=False, reason=reason)
-    model = RecordModel(cell_with(cell, estimate.constants), thermal, initial_soc=seen.start.soc)
+    method = settings.method or ("kalman" if goes_on and is_new else "least-squares")
+    calibrator = replace(settings, method=method).calibrator(part.cell, part.start)
+    cell, thermal, now = part.cell, settings.thermal, None
+    if isinstance(calibrator, ExtendedKalmanFilter):
+        estimate, now = last_estimate(calibrator.follow(part.fitted)), calibrator.now() if goes_on else None
+    else:
+        estimate = calibrator.estimate(part.fitted)
+    if isinstance(calibrator, PolicyEstimator):
+        cell, thermal = calibrator.cell, False
+    if doubt := part.start.reason or settings.other_load(mean_current_A(part.record)):
+        # of the charge: the resistance, which is settled within 30 %, is not in question
+        estimate = replace(estimate, settled_q_mobile=False, reason=" ".join(filter(None, [estimate.reason, doubt])))
+    model = RecordModel(cell_with(cell, estimate.constants), thermal, initial_soc=part.start.soc)
     return estimate, method, model, now
 
 
 def _end(
-    seen: _Seen, estimate: Estimate, settings: Settings, model: RecordModel | ModelNow, shown: VoltageForecast, ahead: Ahead
+    part: _LoadedPart,
+    estimate: Estimate,
+    settings: Settings,
+    model: RecordModel | ModelNow,
+    shown: VoltageForecast,
+    ahead: Ahead,
 ) -> Forecast | None:
     """What may come after a record; ``None`` if nothing can be told, or is asked of a record that has ended."""
-    if not (seen.in_progress or ahead.is_asked):
+    if not (part.in_progress or ahead.is_asked):
         return None
-    load = settings.future_current_A if ahead.load is None else ahead.load
+    load = ahead.load
     if settings.prior_q_mobile_C is None and settings.cell_q_mobile_C is not None:
         estimate = estimate.within(*settings.cell_q_mobile_C)
     try:
         end = forecast(
-            seen.record,
+            part.record,
             estimate,
             load,
             settings.cut_off_V,
@@ -265,20 +275,20 @@ def _end(
         if ahead.is_asked:
             raise
         return None
-    load_A = seen.future.mean_A if load is None else _largest_A(load, settings.cut_off_V)
+    load_A = part.load.mean_A if load is None else _largest_A(load, settings.cut_off_V)
     # a cell of which nothing is known has no health
     is_known = settings.nominal_Ah is not None or settings.tells_new_capacity(load_A)
-    notes = (*end.notes, *_notes(seen, estimate, settings, shown, load_A))
+    notes = (*end.notes, *_notes(part, estimate, settings, shown, load_A))
     return replace(end, nominal_Ah=end.nominal_Ah if is_known else float("nan"), notes=notes)
 
 
-def _notes(seen: _Seen, estimate: Estimate, settings: Settings, shown: VoltageForecast, load_A: float) -> Iterator[str]:
+def _notes(part: _LoadedPart, estimate: Estimate, settings: Settings, shown: VoltageForecast, load_A: float) -> Iterator[str]:
     """What a forecast rests on, beyond the last sample under load."""
-    other_load, seen_s, rmse_V = settings.other_load(load_A), float(seen.record.time_s[-1]), _rmse_V(shown, seen.record)
+    other_load, seen_s, rmse_V = settings.other_load(load_A), float(part.record.time_s[-1]), _rmse_V(shown, part.record)
     # which is said where the load so far is another one, too
     if other_load and other_load not in estimate.reason:
         yield other_load
-    if float(seen.discharge.time_s[-1]) > seen_s:
+    if float(part.discharge.time_s[-1]) > seen_s:
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
     if settings.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
         yield "The filter expects a cell of some 2 Ah: of another one give the nominal capacity, the life, q_max or constants."
@@ -306,15 +316,15 @@ def _middle(values: FloatArray, estimate: Estimate) -> tuple[float, float]:
     return median, (high - low) / (2.0 * _BAND_SD) if np.isfinite(estimate.sd_q_mobile) else float("nan")
 
 
-def _charge(seen: _Seen, settings: Settings, estimate: Estimate, end: Forecast | None) -> dict[str, float]:
+def _charge(part: _LoadedPart, settings: Settings, estimate: Estimate, end: Forecast | None) -> dict[str, float]:
     """The columns of what was drawn, and of what a full cell would have given: its end comes at the same charge."""
-    drawn_Ah, start, q_mobile = seen.loaded.charge_C / 3600.0, seen.start, estimate.q_mobile
+    drawn_Ah, start, q_mobile = part.loaded.charge_C / 3600.0, part.start, estimate.q_mobile
     predicted_Ah, sd_Ah = (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah, settings.current_gain_sd * drawn_Ah
-    if seen.in_progress:
+    if part.in_progress:
         predicted_Ah, sd_Ah = (float("nan"),) * 2 if end is None else _middle(end.capacity_Ah, estimate)
-    unseen_Ah = seen.loaded.unseen_C / 3600.0
+    unseen_Ah = part.loaded.unseen_C / 3600.0
     return {
-        "capacity_Ah": float("nan") if seen.in_progress or start.soc < 1.0 else drawn_Ah,
+        "capacity_Ah": float("nan") if part.in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": predicted_Ah,
         "sd_predicted_capacity_Ah": hypot(sd_Ah, start.sd_soc * q_mobile / 3600.0, unseen_Ah),
     }
@@ -358,13 +368,13 @@ def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cu
     return more_C
 
 
-def _is_all_logged(seen: _Seen, forecast: VoltageForecast, estimate: Estimate) -> bool:
+def _is_all_logged(part: _LoadedPart, forecast: VoltageForecast, estimate: Estimate) -> bool:
     """
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
-    record, history, parameters = Samples.of(seen.record), history_of(seen.record), (estimate.q_mobile, estimate.r_o)
-    shown = evidence_of(record, seen.cell, seen.start.soc, parameters, history, forecast.at_samples_V)
+    record, history, parameters = Samples.of(part.record), history_of(part.record), (estimate.q_mobile, estimate.r_o)
+    shown = evidence_of(record, part.cell, part.start.soc, parameters, history, forecast.at_samples_V)
     # a charge that tapered off fills any cell, whatever its voltage at rest
     is_lower = shown["start"]["first_V"] < shown["start_V"] and not (history.charge and history.charge.tapered)
     return not (fault_reason(shown) or (is_lower and start_reason(shown)) or doubtful_C(shown))

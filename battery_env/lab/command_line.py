@@ -13,9 +13,10 @@ import re
 import subprocess
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, fields
+from dataclasses import fields
 from difflib import get_close_matches
 from functools import wraps
 from importlib.resources import files
@@ -30,24 +31,20 @@ from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.estimators.joint_fit import fit_cell
 from battery_env.estimators.search import spread_over
 from battery_env.files import check_new, finite_or_none, replacing
-from battery_env.lab.many import calibrate_all
+from battery_env.lab.batch import VERSION, Outcome, Results, calibrate_all, interruptible, workers
 from battery_env.lab.readers.columns import FileFormat, description, recognise
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.readers.testers import find_tester, tester_file
-from battery_env.lab.report import line_of, text_of
-from battery_env.lab.results import Outcome, Results
+from battery_env.lab.report import CALIBRATED_BY, line_of, text_of
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.lab.sources import Source, find_sources, read_source
-from battery_env.lab.workers import interruptible, workers
 from battery_env.loads import constant
-from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
 
 #: What the process returns: all records settled, one or more refused, one or more not settled, Ctrl-C, nobody reads on.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141
 
-_VERSION = files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
 _INSTALLED = "battery-calibrate"
 
 # So many discharges fit beside each other in the figure of a fit.
@@ -62,16 +59,6 @@ def _assignments(text: str) -> dict[str, str]:
     if any(not (name.strip() and equals and value.strip()) for name, equals, value in pairs):
         raise argparse.ArgumentTypeError(f"expected quantity=NAME,quantity=NAME, got {text!r}")
     return {name.strip(): value.strip() for name, _, value in pairs}
-
-
-def _cell_name(text: str) -> re.Pattern[str]:
-    try:
-        pattern = re.compile(text)
-    except re.error as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no regular expression: {error}") from error
-    if pattern.groups != 1:
-        raise argparse.ArgumentTypeError(f"expected a regular expression with one group, such as '(B[0-9]+)_', got {text!r}")
-    return pattern
 
 
 def _jobs(text: str) -> int:
@@ -144,13 +131,8 @@ _SIGN: _Options = {
 _CALIBRATION: _Options = {
     ("--method",): {
         "choices": METHODS,
-        "help": "of calibration: least squares, the filter (kalman), or the policy that comes with the package (default: "
-        "least squares; the filter where these do not settle one in progress at a constant load, without --prior and --cell)",
-    },
-    ("--parameters",): {
-        "nargs": "+",
-        "choices": PARAMETER_NAMES,
-        "help": "what to fit; the other is held at the cell's value (default: both). Give it after the files",
+        "help": "of calibration: least squares, the filter (kalman), or the policy that comes with the package (default: the "
+        "filter in progress at a constant load that goes on, without --prior and --cell; else least squares)",
     },
     ("--cut-off",): {
         "dest": "cut_off_V",
@@ -177,17 +159,6 @@ _CALIBRATION: _Options = {
         "metavar": "V",
         "help": "error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
     },
-    ("--current-gain-sd",): {
-        "type": float,
-        "metavar": "SHARE",
-        "help": "standard deviation of the gain of the current sensor, which q_mobile and r_o share (default: 0.005)",
-    },
-    ("--future-current",): {
-        "dest": "future_current_A",
-        "type": float,
-        "metavar": "A",
-        "help": "current after the end of a record in progress, A (default: its last one, or as so far if it varied)",
-    },
     ("--cell",): {
         "type": Path,
         "metavar": "FILE",
@@ -207,23 +178,12 @@ _CALIBRATION: _Options = {
         "metavar": "DEGC",
         "help": "temperature of the surroundings, degC (default: the first one measured, or the model cell's 19 degC)",
     },
-    ("--isothermal",): {
-        "dest": "thermal",
-        "action": "store_false",
-        "help": "keep the temperature of the model constant (default: it moves, or as in the fit of --cell)",
-    },
 }
 _RESULTS: _Options = {
     ("--out",): {
         "type": Path,
         "metavar": "DIR",
         "help": "write the table of estimates (CSV, Parquet), the voltages and figures there",
-    },
-    ("--cell-name",): {
-        "type": _cell_name,
-        "metavar": "PATTERN",
-        "help": "regular expression whose group is the name of the cell in the name of a file, such as '(B[0-9]+)_' (default: "
-        "the folder, if records lie in several, or else the file)",
     },
     ("--table-only",): {"action": "store_true", "help": "write no voltages of single discharges"},
     ("--force",): {"action": "store_true", "help": "replace results that are there already"},
@@ -264,7 +224,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
         epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
+    parser.add_argument("--version", action="version", version=f"battery_env {VERSION}")
     _add(parser.add_argument_group("calibration"), _CALIBRATION, default=argparse.SUPPRESS)
     _add(parser.add_argument_group("results"), _RESULTS)
     parser.add_argument(
@@ -325,7 +285,7 @@ def _forecast_parser(name: str) -> argparse.ArgumentParser:
         help="the load to come: time_s, from 0 at the last sample under load, and current_A or power_W, each held until the "
         "next (default: as so far)",
     )
-    known = ("--cut-off", "--prior", "--initial-soc", "--mismatch", "--cell", "--nominal", "--ambient", "--isothermal")
+    known = ("--cut-off", "--prior", "--initial-soc", "--mismatch", "--cell", "--nominal", "--ambient")
     options = {flags: how for flags, how in _CALIBRATION.items() if flags[0] in known}
     _add(parser.add_argument_group("calibration"), options, default=argparse.SUPPRESS)
     group = parser.add_argument_group("results")
@@ -359,7 +319,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
-    parser.add_argument("--version", action="version", version=f"battery_env {_VERSION}")
+    parser.add_argument("--version", action="version", version=f"battery_env {VERSION}")
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("calibrate", help="capacity and resistance of cells from their discharges", add_help=False)
     for name, (_, what) in _OTHERS.items():
@@ -407,12 +367,11 @@ def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) ->
     settings = _settings(options)
     settings.calibrator()  # what it refuses it refuses of every file
     with _saying():
-        sources = find_sources(options.records, options.cell_name)
+        sources = find_sources(options.records)
     file_format = _file_format(options)
     if options.out is None:
         return _calibrate(sources, settings, file_format, options, None)
-    made_with = {"battery_env": _VERSION, **asdict(settings), **asdict(file_format), "voltages": not options.table_only}
-    results = Results(options.out, sources, not options.table_only, settings, made_with)
+    results = Results(options.out, sources, settings, file_format, not options.table_only)
     with results.opened(options.force):
         return _calibrate(sources, settings, file_format, options, results)
 
@@ -424,35 +383,67 @@ def _calibrate(
     options: argparse.Namespace,
     results: Results | None,
 ) -> int:
-    done: list[Outcome] = []
-    status = None
+    states: Counter[str] = Counter()
+    first: Outcome | None = None
+    interrupted = None
     if results and results.names:
-        print(f"going on: {len(results.names)} discharges are done, as {results.run} says", file=sys.stderr, flush=True)
+        absent = f", {results.absent} of them of files that are not there now" if results.absent else ""
+        print(
+            f"going on: {len(results.names)} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True
+        )
     try:
         with workers(options.jobs, options.scheduler) as executor:
             ahead = 64 if options.scheduler or options.jobs == -1 else 2 * options.jobs
             outcomes = calibrate_all(sources, file_format, settings, results, executor, ahead)
             with saying_that_it_compiles():
-                first = list(islice(outcomes, 1))
-            for outcome in chain(first, outcomes):
-                done.append(outcome)
-                _show(done, options.json)
+                waited_for = list(islice(outcomes, 1))
+            for outcome in chain(waited_for, outcomes):
+                _report(outcome, options.json)
+                if first is not None and not options.json:  # the only one is printed in full
+                    for each in (first, outcome) if states.total() == 1 else (outcome,):
+                        _print_line(each)
+                first = first or outcome
+                states[_state(outcome)] += 1
     except KeyboardInterrupt as interruption:
         print("interrupted: what is done is kept" + (", and the same command goes on" if results else ""), file=sys.stderr)
-        status = getattr(interruption, "status", INTERRUPTED)
+        interrupted = getattr(interruption, "status", INTERRUPTED)
     finally:
         if results and results.has_numbers:
             with _saying():
                 written = results.write_tables()
     if not options.json:
-        _conclude(done, settings)
+        if states.total() > 1:
+            counts = ", ".join(f"{states[state]} {state}" for state in ("settled", "not settled", "refused"))
+            print(f"\n{states.total()} discharges: {counts}")
+            if settings.method == "policy":
+                print(f"calibrated by {CALIBRATED_BY[settings.method]}")
+        elif first and first.found:
+            print(_coloured(text_of(first.record, first.found), first.found.settled))
         if results and results.has_numbers:
             print("\nwritten: " + ", ".join(map(str, written)))
-    if status is not None:
-        return status
-    if any(each.error for each in done):
-        return REFUSED
-    return SETTLED if all(each.found and each.found.settled for each in done) else NOT_SETTLED
+    if interrupted is not None:
+        return interrupted
+    return REFUSED if states["refused"] else NOT_SETTLED if states["not settled"] else SETTLED
+
+
+def _state(outcome: Outcome) -> str:
+    if outcome.error or outcome.found is None:
+        return "refused"
+    return "settled" if outcome.found.settled else "not settled"
+
+
+def _report(outcome: Outcome, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps({name: finite_or_none(value) for name, value in outcome.row().items()}), flush=True)
+    if outcome.notes:
+        print(f"warning: {outcome.record}: {outcome.notes}", file=sys.stderr)
+    if outcome.error:
+        print(f"error: {outcome.error}", file=sys.stderr, flush=True)
+
+
+def _print_line(outcome: Outcome) -> None:
+    if outcome.found:
+        print(_coloured(line_of(outcome.record, outcome.found), outcome.found.settled), flush=True)
 
 
 def _file_format(options: argparse.Namespace) -> FileFormat:
@@ -509,19 +500,21 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
 def forecast(arguments: Sequence[str] | None = None, name: str = "python -m battery_env forecast") -> int:
     """The command ``forecast``; its exit status is 3 if something in the record contradicts the estimate."""
     options = _forecast_parser(name).parse_args(arguments)
-    from battery_env.lab.running import EndFiles, end_of_record  # here, as matplotlib takes long to import
+    from battery_env.lab.running import end_of_record, files_of  # here, as matplotlib takes long to import
 
     settings, file_format = _settings(options), _file_format(options)
     if options.life and settings.prior_q_mobile_C is not None:
         raise ValueError("--life and --prior say the same: give one of them")
-    files = EndFiles(options.out, options.record) if options.out else None
+    written = files_of(options.record, options.out) if options.out else []
+    if written:
+        check_new(*written)
     with _saying(), saying_that_it_compiles():
         end = end_of_record(options.record, settings, file_format, options.life, options.load)
     print(json.dumps(end.row()) if options.json else end.text())
-    if files:
-        files.write(end)
-        if not options.json:
-            print(f"\nwritten: {files.table}, {files.figure}")
+    for path in written:
+        end.write(path)
+    if written and not options.json:
+        print(f"\nwritten: {', '.join(map(str, written))}")
     return NOT_SETTLED if end.contradicted else SETTLED
 
 
@@ -615,29 +608,3 @@ def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Dischar
                 text = " ".join(str(error).split())
                 raise ValueError(text if source.path in text else f"{source.argument}: {text}") from error
     return discharges
-
-
-def _show(done: Sequence[Outcome], as_json: bool) -> None:
-    """Prints the last one as it comes: a line each, but the first one waits, as the only one is printed in full."""
-    last = done[-1]
-    if as_json:
-        print(json.dumps({name: finite_or_none(value) for name, value in last.row().items()}), flush=True)
-    if last.notes:
-        print(f"warning: {last.record}: {last.notes}", file=sys.stderr)
-    if last.error:
-        print(f"error: {last.error}", file=sys.stderr, flush=True)
-    if len(done) > 1 and not as_json:
-        for each in done if len(done) == 2 else done[-1:]:
-            if each.found:
-                print(_coloured(line_of(each.record, each.found), each.found.settled), flush=True)
-
-
-def _conclude(done: Sequence[Outcome], settings: Settings) -> None:
-    if len(done) > 1:
-        settled = sum(bool(each.found and each.found.settled) for each in done)
-        refused = sum(bool(each.error) for each in done)
-        print(f"\n{len(done)} discharges: {settled} settled, {len(done) - settled - refused} not settled, {refused} refused")
-        if settings.method == "policy":
-            print(f"calibrated by {settings.calibrated_by}")
-    elif done and done[0].found:
-        print(_coloured(text_of(done[0].record, done[0].found), done[0].found.settled))

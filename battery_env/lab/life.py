@@ -184,13 +184,13 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     for position, discharge in enumerate(discharges):
         row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
         try:
-            rows.append(row | _told(discharge, cut_off_V, calibrator))
+            rows.append(row | _row_of(discharge, cut_off_V, calibrator))
         except ValueError as error:  # of one that cannot be used
             rows.append(row | {"settled": False, "valid": False, "reason": str(error)})
     return life_of(pd.DataFrame(rows, columns=_COLUMNS))
 
 
-def _told(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> dict[str, Any]:
+def _row_of(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> dict[str, Any]:
     """What one discharge says alone."""
     record = discharge.loaded_part(cut_off_V)
     estimate = calibrator.estimate(record)

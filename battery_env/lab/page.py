@@ -10,14 +10,13 @@ import pandas as pd
 import plotly.graph_objects as go
 import streamlit as st
 
+from battery_env.lab.batch import FileFormat, attempt
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.life import Life, track_life
-from battery_env.lab.many import FileFormat, find_sources
 from battery_env.lab.report import Calibration
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
-from battery_env.lab.sources import read_source, record_name
-from battery_env.lab.workers import attempt
+from battery_env.lab.sources import find_sources, no_formula, read_source, record_name
 from battery_env.loads import constant
 from battery_env.plotting import COLOURS
 from battery_env.records.discharge import Discharge
@@ -51,7 +50,7 @@ def calibrated(paths: list[str], settings: Settings, one_cell: bool, troubles: l
     for number, (source, recording) in enumerate(recordings):
         name = record_name(source.stem, recording.meta.get("cycle"))
         bar.progress(number / len(recordings), f"{name}, {number + 1} of {len(recordings)}; the very first one takes longer")
-        cell = str(recording.meta.get("cell", "cell" if one_cell else source.cell))
+        cell = no_formula(str(recording.meta.get("cell", "cell" if one_cell else source.cell)))
         seen, notes, error = attempt(looked_at, name, cell, recording, settings)
         troubles += [f"**{name}**: {each}" for each in (*notes, error) if each]
         found += [seen] if seen else []

@@ -17,6 +17,8 @@ from battery_env.records.model import VoltageForecast
 
 #: The methods, for readers of a figure.
 METHOD_NAMES = {"least-squares": "least squares", "kalman": "Kalman filter", "policy": "policy"}
+#: The methods, for readers of a text.
+CALIBRATED_BY = {"kalman": "the Kalman filter", "policy": "the policy that comes with the package"}
 # Columns of the parameters.
 _COLUMN_OF = {name: f"{name}_{parameter.unit}" for name, parameter in PARAMETERS.items()}
 
@@ -146,10 +148,9 @@ def text_of(name: str, found: Calibration) -> str:
         f"{found.shown('drawn_Ah')} drawn"
     ]
     if found.method != "least-squares":
-        by = found.settings.calibrated_by if found.method == "policy" else "the Kalman filter"
-        lines.append(f"calibrated by {by}")
+        lines.append(f"calibrated by {CALIBRATED_BY[found.method]}")
     lines.append("")
-    for column, remark in _told(found):
+    for column, remark in _rows_of_text(found):
         line = f"  {_HOW[column]['text'].format(found.settings):<22}{found.shown(column):>12}"
         lines.append(f"{line}   {remark}" if remark else line)
     if not found.settled:
@@ -159,7 +160,7 @@ def text_of(name: str, found: Calibration) -> str:
     return "\n".join(lines)
 
 
-def _told(found: Calibration) -> Iterator[tuple[str, str]]:
+def _rows_of_text(found: Calibration) -> Iterator[tuple[str, str]]:
     """The columns that a text has, in their order, each with a remark."""
     if found.initial_soc < 1.0 or found.sd_initial_soc:
         yield "initial_soc", f"sd {found.shown('sd_initial_soc')}"

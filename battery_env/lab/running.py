@@ -16,7 +16,7 @@ from battery_env.checks import LoadUnit
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import is_only_imprecise
-from battery_env.files import check_new, finite_or_none, replacing
+from battery_env.files import finite_or_none, replacing
 from battery_env.lab.calibrate import Ahead, calibrated
 from battery_env.lab.forecast import Forecast, decimals
 from battery_env.lab.life import Life, track_life
@@ -25,7 +25,7 @@ from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import Source, find_sources, read_source, record_name
 from battery_env.loads import Load, LoadToCome
-from battery_env.plotting import literal, save_figure
+from battery_env.plotting import literal
 from battery_env.records.discharge import Discharge
 
 # By name of the column of a profile: the unit of the load.
@@ -40,13 +40,11 @@ class End:
     :param name: what the discharge is called in results
     :param calibration: what the record says, and what may come
     :param life: of the cell before; ``None``: not known
-    :param prior_q_mobile_C: mean and standard deviation that were carried over, C; ``None``: none were
     """
 
     name: str
     calibration: Calibration
     life: Life | None = None
-    prior_q_mobile_C: tuple[float, float] | None = None
 
     @property
     def forecast(self) -> Forecast:
@@ -61,7 +59,7 @@ class End:
 
     def row(self) -> dict[str, Any]:
         """All of it by name, with units; of what is uncertain the quantiles ``probability``."""
-        found, past = self.forecast, self.life
+        found, prior_C = self.forecast, self.calibration.settings.prior_q_mobile_C
         samples = {
             "eod_time_s": found.eod_time_s,
             "remaining_s": found.remaining_s,
@@ -81,8 +79,8 @@ class End:
             "probability": list(BAND),
             **{name: [finite_or_none(value) for value in quantile(values, BAND).tolist()] for name, values in samples.items()},
             "nominal_Ah": finite_or_none(found.nominal_Ah),
-            "life_discharges": 0 if past is None else int(past.table["valid"].sum()),
-            "prior_q_mobile_C": None if self.prior_q_mobile_C is None else list(self.prior_q_mobile_C),
+            "life_discharges": 0 if self.life is None else int(self.life.table["valid"].sum()),
+            "prior_q_mobile_C": None if prior_C is None else list(prior_C),
             "notes": list(found.notes),
         }
 
@@ -94,11 +92,21 @@ class End:
             left_out = f"; {(~valid).sum()} left out" if not valid.all() else ""
             plural = "" if valid.sum() == 1 else "s"
             lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}")
-        if self.prior_q_mobile_C is not None:
-            mean_Ah, sd_Ah = (each_C / 3600.0 for each_C in self.prior_q_mobile_C)
+        if (prior_C := self.calibration.settings.prior_q_mobile_C) is not None:
+            mean_Ah, sd_Ah = (each_C / 3600.0 for each_C in prior_C)
             digits = decimals(mean_Ah, 3)
             lines.append(f"q_max before: {mean_Ah:.{digits}f} Ah, sd {sd_Ah:.{digits}f} Ah")
         return "\n".join([*lines, self.forecast.summary()])
+
+    def write(self, path: Path) -> None:
+        """Write a new file: JSON of the row, or a figure."""
+        with replacing(path, new=True) as part:
+            if path.suffix == ".json":
+                part.write_text(json.dumps(self.row(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+            else:
+                figure = self.forecast.plot()
+                figure.suptitle(f"{literal(self.name)}, then {self.forecast.load_name}", fontsize=10)
+                figure.savefig(part, dpi="figure")
 
 
 def forecast_end(
@@ -158,16 +166,14 @@ def read_load(path: str | Path) -> Load:
     return load
 
 
-def read_running(argument: str, file_format: FileFormat) -> tuple[Source, Discharge]:
-    """Read a discharge in progress; of a file that holds several the last one."""
-    sources = find_sources([argument])
-    if len(sources) > 1:
-        raise ValueError(f"{argument} holds {len(sources)} files: name the one in progress, and the others with --life")
-    running = read_source(sources[0], file_format)[-1]
-    return sources[0]._replace(cycle=running.meta.get("cycle")), running.discharge()
+def files_of(argument: str, folder: Path) -> list[Path]:
+    """Where the end of a record is written to, which is named as on the command line."""
+    source = find_sources([argument])[0]
+    name = record_name(source.stem, source.cycle)
+    return [folder / f"{name}_forecast.{suffix}" for suffix in ("json", "png")]
 
 
-def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
+def _read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
     """
     Read the discharges of a cell before the one in progress, up to it where it is among them. All that is named counts as of
     one cell: of several folders with a warning. What cannot be read is left out with a warning.
@@ -178,15 +184,15 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
     if len(folders) > 1:
         warnings.warn(f"--life: the records of {', '.join(folders)} are taken for one cell's", stacklevel=2)
     for source in sources:
+        is_reached = Path(source.path).resolve() == Path(running.path).resolve()
         try:
             recordings = read_source(source, file_format)
         except Exception as error:  # readers of files raise what they like
             warnings.warn(f"{source.argument} is left out: {' '.join(str(error).split())}", stacklevel=2)
             continue
-        is_reached = Path(source.path).resolve() == Path(running.path).resolve()
-        if is_reached:
-            recordings = [each for each in recordings if each.meta.get("cycle", math.inf) < (running.cycle or 0)]
         for recording in recordings:
+            if is_reached and recording.meta.get("cycle", math.inf) >= (running.cycle or 0):
+                continue
             try:
                 discharges.append(recording.discharge())
             except (TypeError, ValueError) as error:
@@ -203,14 +209,18 @@ def end_of_record(
     argument: str, settings: Settings, file_format: FileFormat, life: Sequence[str] = (), load: Path | None = None
 ) -> End:
     """
-    The end of a discharge in a file, as the command line names it, the discharges before it (none: their life is not known)
-    and the load to come (``None``: as so far).
+    The end of a discharge in a file, as the command line names it (of several the last one), the discharges before it (none:
+    their life is not known) and the load to come (``None``: as so far).
     """
     to_come = None if load is None else read_load(load)
-    source, running = read_running(argument, file_format)
+    sources = find_sources([argument])
+    if len(sources) > 1:
+        raise ValueError(f"{argument} holds {len(sources)} files: name the one in progress, and the others with --life")
+    recording = read_source(sources[0], file_format)[-1]
+    source, running = sources[0]._replace(cycle=recording.meta.get("cycle")), recording.discharge()
     past = None
     if life:
-        before = read_life(life, source, file_format)
+        before = _read_life(life, source, file_format)
         named = sorted({each.meta["cell"] for each in [*before, running] if "cell" in each.meta})
         if len(named) > 1:
             raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")
@@ -224,22 +234,4 @@ def end_of_record(
             f"{argument} reaches {settings.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "
             "forecast: calibrate it, or give a lower --cut-off"
         )
-    return End(record_name(source.stem, source.cycle), found, past, settings.prior_q_mobile_C)
-
-
-class EndFiles:
-    """The files that an end is written to, refused if they are there already."""
-
-    def __init__(self, folder: Path, argument: str) -> None:
-        (source,) = find_sources([argument])[:1]
-        name = f"{record_name(source.stem, source.cycle)}_forecast"
-        self.table, self.figure = folder / f"{name}.json", folder / f"{name}.png"
-        check_new(self.table, self.figure)
-
-    def write(self, end: End) -> None:
-        """Write both."""
-        with replacing(self.table) as part:
-            part.write_text(json.dumps(end.row(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        figure = end.forecast.plot()
-        figure.suptitle(f"{literal(end.name)}, then {end.forecast.load_name}", fontsize=10)
-        save_figure(figure, self.figure)
+    return End(record_name(source.stem, source.cycle), found, past)

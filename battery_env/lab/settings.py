@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from battery_env.checks import check_not_negative, check_positive
+from battery_env.checks import check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
@@ -28,12 +28,17 @@ METHODS: tuple[Method, ...] = get_args(Method)
 # estimate within this ratio.
 _SAME_LOAD = 1.25
 _AMBIENT_LIMITS_C = (-60.0, 100.0)
-# What the policy that comes with the package cannot be told: it has learned on a new 18650, of which it finds both.
+# What a policy cannot be told: it has learned on one model, a new 18650.
 _NOT_FOR_POLICIES = (
-    *("cell", "parameters", "prior_q_mobile_C", "mismatch_V", "current_gain_sd", "ambient_C", "q_mobile_bounds_C"),
+    "cell",
+    "parameters",
+    "prior_q_mobile_C",
+    "mismatch_V",
+    "current_gain_sd",
+    "ambient_C",
+    "q_mobile_bounds_C",
     "initial_soc",
 )
-
 # Nor may be said beside a path: it tells which of all go together, at the temperature of its lives.
 _NOT_WITH_PATH = ("parameters", "ambient_C")
 
@@ -44,15 +49,14 @@ class Settings:
     How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
     ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs.
 
-    :param method: of calibration; ``None``: least squares; and where they do not settle a record in progress at a constant
-        load that goes on, of a cell of which neither a prior nor the constants are known, the filter
+    :param method: of calibration; ``None``: the filter for a record in progress at a constant load that goes on, of a cell of
+        which neither a prior nor the constants are known, and else least squares. ``"policy"`` is the one that comes with the
+        package, for both parameters; its model is a new 18650 at constant temperature
     :param parameters: which to search for; the other is held at the cell's value
     :param cut_off_V: voltage at which the discharge ends, V
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
     :param mismatch_V: error to expect of the model itself, V
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
-    :param future_current_A: current beyond the end of a record, A; ``None``: the last one of a constant load, and blocks of
-        the record of one that varied
     :param thermal: whether the temperature of the model moves
     :param ambient_C: temperature at the start and of the surroundings, degC; ``None``: the first one measured, or what
         else the record says of its surroundings, or the cell's
@@ -79,7 +83,6 @@ class Settings:
     prior_q_mobile_C: tuple[float, float] | None = None
     mismatch_V: float = UNFITTED_MISMATCH_V
     current_gain_sd: float = 0.005
-    future_current_A: float | None = None
     thermal: bool = True
     ambient_C: float | None = None
     nominal_Ah: float | None = None
@@ -101,8 +104,6 @@ class Settings:
             raise ValueError(f"the ambient temperature must lie within {low:g} .. {high:g} degC, got {self.ambient_C!r}")
         if not 0.0 < self.cut_off_V < np.inf:
             raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
-        if self.future_current_A is not None:
-            check_not_negative(future_current_A=self.future_current_A)
         if self.path is not None:
             if self.method not in (None, "least-squares"):
                 raise ValueError(f"a path of aging cells is for least squares, got the method {self.method!r}")
@@ -192,8 +193,3 @@ class Settings:
             initial_soc=stated if start is None else (start.soc, start.sd_soc),
             q_mobile_bounds_C=Q_MOBILE.limits if self.q_mobile_bounds_C is None else self.q_mobile_bounds_C,
         )
-
-    @property
-    def calibrated_by(self) -> str:
-        """The calibrator, for readers."""
-        return "the policy that comes with the package" if self.method == "policy" else self.method or "least-squares"

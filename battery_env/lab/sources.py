@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,8 +21,10 @@ _RESULT_HEADS = (b"record,source,cell,cycle,", b"time_s,voltage_V,current_A,mode
 _NASA_SUFFIX = ".mat"
 # What NASA's discharges have beside them, in the layout of the bundled ones, is a table of tests and no record.
 _NO_RECORDS = ("cycles.csv",)
-# So many files that are left out are named.
+# So many files are named where many are meant.
 _MOST_NAMED = 10
+# How what workbooks take for a formula begins.
+_FORMULA_HEADS = ("=", "+", "-", "@")
 
 
 class Source(NamedTuple):
@@ -33,23 +35,30 @@ class Source(NamedTuple):
     :param cycle: which discharge; ``None``: all of them
     :param stem: what names of results start with
     :param cell: which cell it is of
+    :param given: the argument that names it, as the folder that it was found in
     """
 
     path: str
     cycle: int | None
     stem: str
     cell: str
+    given: str
 
     @property
     def argument(self) -> str:
         """As on the command line."""
         return self.path if self.cycle is None else f"{self.path}:{self.cycle}"
 
+    @property
+    def key(self) -> str:
+        """The same wherever the command is called."""
+        return key_of(self.argument)
 
-def find_sources(arguments: Iterable[str], cell_name: re.Pattern[str] | None = None) -> list[Source]:
+
+def find_sources(arguments: Iterable[str]) -> list[Source]:
     """
-    What the arguments of a command line name. A cell is called as its file; as its folder, if folders are given and their
-    records lie in several; or as the group that a pattern finds in the name of the file.
+    What the arguments of a command line name. A cell is called as its file; or as its folder, if folders are given and their
+    records lie in several.
     """
     arguments = list(arguments)
     inside = {argument: _records(Path(argument)) for argument in arguments if Path(argument).is_dir()}
@@ -57,18 +66,15 @@ def find_sources(arguments: Iterable[str], cell_name: re.Pattern[str] | None = N
     sources = []
     for argument in arguments:
         if inside.get(argument):
-            sources += [Source(str(file), None, *_names(file, folders)) for file in inside[argument]]
+            sources += [Source(str(file), None, *_names(file, folders), argument) for file in inside[argument]]
             continue
         name, colon, cycle = argument.rpartition(":")
         if not (colon and cycle.isdecimal()) or Path(argument).exists():
             name, cycle = argument, ""
         stem = name if name in BUNDLED_CELLS else _stem(Path(name))
-        sources.append(Source(name, int(cycle) if cycle else None, stem, stem))
-    sources = list({source.argument: source for source in sources}.values())  # what is named twice is one
-    if cell_name is None:
-        return sources
-    found = [cell_name.search(Path(source.path).name) for source in sources]
-    return [source._replace(cell=_plain(match[1])) if match else source for source, match in zip(sources, found, strict=True)]
+        sources.append(Source(name, int(cycle) if cycle else None, stem, stem, argument))
+    sources = [each._replace(path=f"./{each.path}") if each.path.startswith(_FORMULA_HEADS) else each for each in sources]
+    return list({source.key: source for source in sources}.values())  # what is named twice is one
 
 
 def _records(folder: Path) -> list[Path]:
@@ -93,9 +99,13 @@ def _records(folder: Path) -> list[Path]:
         printable(path.relative_to(folder).as_posix()) for path in sorted(other, key=_by_number) if not _is_result(path)
     ]
     if records and left_out:
-        more = f" and {len(left_out) - _MOST_NAMED} more" if len(left_out) > _MOST_NAMED else ""
-        warnings.warn(f"{folder}: {', '.join(left_out[:_MOST_NAMED])}{more} left out, by their names no records", stacklevel=3)
+        warnings.warn(f"{folder}: {few_of(left_out)} left out, by their names no records", stacklevel=3)
     return sorted(records, key=_by_number)
+
+
+def few_of(names: Sequence[str]) -> str:
+    """The first of many names."""
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else "")
 
 
 def _by_number(path: Path) -> tuple[list[list[str | int]], Path]:
@@ -139,9 +149,8 @@ def _stem(path: Path) -> str:
 
 
 def _plain(name: str) -> str:
-    """A name of files and of cells in tables: what cannot be printed is a line, and nothing begins as a formula does."""
-    name = "".join(each if each.isprintable() else "_" for each in name)
-    return f"_{name}" if name.startswith(("=", "+", "-", "@")) else name
+    """A name of files and of cells: what cannot be printed is a line."""
+    return no_formula("".join(each if each.isprintable() else "_" for each in name))
 
 
 def printable(text: str) -> str:
@@ -149,10 +158,30 @@ def printable(text: str) -> str:
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
+def no_formula(text: str) -> str:
+    """A text that no workbook takes for a formula."""
+    return f"_{text}" if text.startswith(_FORMULA_HEADS) else text
+
+
+def record_name(stem: str, cycle: int | None) -> str:
+    """How one discharge is called in results."""
+    return stem if cycle is None else f"{stem}_{cycle:03d}"
+
+
+def is_bundled(path: str) -> bool:
+    """Whether a bundled cell is meant, and no file of its name."""
+    return path in BUNDLED_CELLS and not Path(path).exists()
+
+
+def key_of(argument: str) -> str:
+    """What an argument of a command line names, the same wherever the command is called."""
+    return argument if is_bundled(argument.partition(":")[0]) else os.path.abspath(argument)
+
+
 def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
     """Read what a source names."""
     path, cycle = source.path, source.cycle
-    if path in BUNDLED_CELLS and not Path(path).exists():
+    if is_bundled(path):
         columns = ("time_s", "voltage_V", "current_A", "temperature_C")
         recordings = [
             Recording({name: getattr(each, name) for name in columns}, each.meta) for each in load_nasa_discharges(path)
@@ -177,8 +206,3 @@ def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
         has = f"has discharges {path}:{known[0]} .. {path}:{known[-1]}" if known else "has one discharge, without a number"
         raise ValueError(f"{path} {has}, got {source.argument}")
     return chosen
-
-
-def record_name(stem: str, cycle: int | None) -> str:
-    """How one discharge is called in results."""
-    return stem if cycle is None else f"{stem}_{cycle:03d}"

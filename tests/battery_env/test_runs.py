@@ -11,28 +11,31 @@ import sys
 import time
 import warnings
 import zipfile
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+from matplotlib.figure import Figure
 from pyarrow import parquet
 
+import battery_env
 from battery_env import Settings, files, load_nasa_discharges, read_discharges
 from battery_env.files import locked
-from battery_env.lab import many
+from battery_env.lab import batch, command_line
+from battery_env.lab.batch import attempt, workers
 from battery_env.lab.command_line import main
-from battery_env.lab.workers import attempt, in_order, workers
+from battery_env.lab.sources import find_sources
 from tests.faults import a_full_disk, squared_unless_it_ends_its_process
 
-ROWS = 12
+ROWS = 8
 
 
-def write(record, path):
+def write(record, path, **more):
     columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
-    pd.DataFrame(columns).to_csv(path, index=False)
+    pd.DataFrame(columns).assign(**more).to_csv(path, index=False)
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +52,15 @@ def started(*arguments, **more):
 
 
 def wait_for(condition):
-    end = time.monotonic() + 120.0
+    end = time.monotonic() + 300.0
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.02)
 
 
 def rows_in(out):
-    return max(len((out / "estimate.jsonl").read_bytes().splitlines()) - 1, 0) if (out / "estimate.jsonl").exists() else 0
+    run = out / "estimate.jsonl"
+    return sum(b'"row"' in line for line in run.read_bytes().splitlines()) if run.exists() else 0
 
 
 def children_of(pid):
@@ -91,7 +95,7 @@ def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed,
     others = workers_of(process.pid)
     assert len(others) == 2
     os.kill(others[0] if end == "worker" else process.pid, signal.SIGKILL if end == "worker" else end)
-    _, error = process.communicate(timeout=120)
+    _, error = process.communicate(timeout=300)
     wait_for(lambda: not any(map(is_alive, others)))
     if end == "worker":  # one takes its place
         assert process.returncode == 0, error
@@ -104,71 +108,198 @@ def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed,
         assert main(["calibrate", *map(str, arguments[:-2])]) == 0
         shown = capsys.readouterr()
         assert f"going on: {done} discharges are done" in shown.err
-        assert shown.out.count("\nc") == ROWS - 1 and "12 discharges: 12 settled" in shown.out
+        assert shown.out.count("\nc") == ROWS - 1 and f"{ROWS} discharges: {ROWS} settled" in shown.out
     assert (tmp_path / "estimate.csv").read_bytes() == undisturbed
 
 
 def test_a_call_that_its_process_does_not_survive_is_an_error_and_all_others_are_made():
     with workers(2) as pool:
-        made = list(in_order(pool, 4, squared_unless_it_ends_its_process, [(n, (2, 3)) for n in range(8)]))
-        assert [call[0] for call, _ in made] == list(range(8))
-        assert [each.result for _, each in made] == [0, 1, None, None, 16, 25, 36, 49]
-        assert [bool(each.error) for _, each in made] == [n in (2, 3) for n in range(8)]
-        assert list(in_order(pool, 4, squared_unless_it_ends_its_process, [(3, ())])) == [((3, ()), (9, [], ""))]
+        made = [pool.submit(squared_unless_it_ends_its_process, n, (1,)) for n in range(5)]
+        assert [isinstance(each.exception(), BrokenExecutor) for each in made] == [n == 1 for n in range(5)]
+        assert [each.result() for n, each in enumerate(made) if n != 1] == [0, 4, 9, 16]
 
 
-def test_of_two_commands_on_one_folder_one_is_refused_and_no_row_is_lost(lab, undisturbed, tmp_path, capsys):
-    first = started(lab, "--out", tmp_path, "--table-only")
-    wait_for(lambda: rows_in(tmp_path))
-    first.send_signal(signal.SIGSTOP)  # as slow as it takes
-    assert main(["calibrate", str(lab), "--out", str(tmp_path), "--table-only"]) == 2
-    assert "is being written by another command: wait for it, or choose another --out" in capsys.readouterr().err
-    first.send_signal(signal.SIGCONT)
-    first.communicate(timeout=120)
-    assert first.returncode == 0
-    assert (tmp_path / "estimate.csv").read_bytes() == undisturbed
-    with locked(tmp_path / "c1_estimate.jsonl"):  # of another file
-        assert main(["calibrate", f"{lab}/c2.csv", "--out", str(tmp_path), "--table-only"]) == 0
+@pytest.fixture(scope="module")
+def said():
+    """What a discharge says, and a fit to it."""
+    record = load_nasa_discharges("B0005")[0]
+    return battery_env.calibrate(record), battery_env.fit_cell([record])
+
+
+@pytest.fixture
+def quick(said, monkeypatch):
+    """Calibration without its work: a discharge says what another one said, in files of a few bytes."""
+    of_discharge, fit = said
+    monkeypatch.setattr(batch, "calibrate", lambda discharge, settings: of_discharge)
+    monkeypatch.setattr(batch, "_voltages_of", lambda name, found: {"csv": b"voltages", "png": b"picture"})
+    monkeypatch.setattr(batch, "_draw_life", lambda whole, path: path.write_bytes(b"life"))
+    monkeypatch.setattr(command_line, "fit_cell", lambda *given, **more: fit)
+    monkeypatch.setattr("battery_env.plotting.plot_cell_fit", lambda *given: Figure((1.0, 1.0)))
+
+
+@pytest.fixture
+def pair(tmp_path, monkeypatch):
+    """Two folders of records, of the same names, and where all results go."""
+    monkeypatch.chdir(tmp_path)
+    for folder, cell in (("lab", "B0005"), ("other", "B0006")):
+        Path(folder).mkdir()
+        for number, record in enumerate(load_nasa_discharges(cell)[:2]):
+            write(record, Path(folder, f"c{number}.csv"))
+    write(load_nasa_discharges("B0006")[9].until(1500.0), Path("c1.csv"))
+    return tmp_path
+
+
+COMMANDS = {
+    "a folder": "calibrate lab --out out",
+    "its table": "calibrate lab --out out --table-only",
+    "a file of it": "calibrate lab/c1.csv --out out",
+    "some of it": "calibrate lab/c0.csv lab/c1.csv --out out",
+    "another folder": "calibrate other --out out",
+    "a file of the same name": "calibrate other/c1.csv --out out",
+    "other settings": "calibrate lab --out out --nominal 2",
+    "a forecast": "forecast c1.csv --prior 7000 70 --out out",
+    "a fit": "fit lab/c1.csv --out out/life.json",
+    "another fit": "fit lab/c1.csv --out out/c1_voltage.json",
+}
+
+
+def contents(out):
+    return {path.name: path.read_bytes() for path in out.iterdir() if not path.name.startswith(".")} if out.exists() else {}
+
+
+@pytest.mark.parametrize("ends", ["whole", "before its tables"])
+@pytest.mark.parametrize("first", COMMANDS)
+def test_no_command_touches_what_another_one_wrote_to_the_same_folder(first, ends, quick, pair, capsys, monkeypatch):
+    if ends != "whole" and not COMMANDS[first].startswith("calibrate lab "):
+        pytest.skip("others end whole or not at all")
+    with monkeypatch.context() as patch:
+        if ends != "whole":
+            patch.setattr(batch.Results, "write_tables", lambda results: [])
+        assert main(COMMANDS[first].split()) in (0, 3)
+    owners = dict.fromkeys(contents(pair / "out"), first)
+    for name in (*(each for each in COMMANDS if each != first), first):
+        before = contents(pair / "out")
+        capsys.readouterr()
+        status, error = main(COMMANDS[name].split()), capsys.readouterr().err
+        after = contents(pair / "out")
+        assert {file: after[file] for file in before if owners[file] != name or status == 2} == {
+            file: content for file, content in before.items() if owners[file] != name or status == 2
+        }, name
+        assert status in (0, 3) or ("out/" in error and "--out" in error and after.keys() == before.keys()), name
+        owners |= {file: name for file in after if file not in owners}
+
+
+def test_another_command_is_told_what_is_there_and_may_replace_it(quick, pair, capsys):
+    assert main("calibrate lab --out out".split()) == 0
+    for second, said in (
+        ("other", f"estimate.jsonl is of a command that reads {pair}/lab; choose another --out, or give --force"),
+        ("lab --nominal 2", "estimate.jsonl is of a command with another nominal_Ah; choose"),
+        ("other --ignore x", f"that reads {pair}/lab with another ignore; choose"),
+        ("lab/c1.csv", "c1_voltage.csv, out/c1_voltage.png would be replaced; choose another --out, or give --force"),
+    ):
+        capsys.readouterr()
+        assert main(f"calibrate {second} --out out".split()) == 2
+        assert said in capsys.readouterr().err
+    assert main("calibrate other --out out --force".split()) == 0
+    assert pd.read_csv("out/estimate.csv")["source"].str.startswith("other").all()
+    assert main(f"calibrate ./other --out ../{pair.name}/out".split()) == 0
+    assert "going on: 2 discharges are done" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("left", [1, 0])
+def test_rows_of_files_that_are_not_there_are_kept(left, quick, pair, capsys):
+    assert main("calibrate lab --out out".split()) == 0
+    before = contents(pair / "out")
+    for number in range(left, 2):
+        Path(f"lab/c{number}.csv").rename(f"c{number}.away")
+    capsys.readouterr()
+    assert main("calibrate lab --out out".split()) == (0 if left else 2)  # nothing is there to be read
+    assert f"{2 - left} of them of files that are not there now" in capsys.readouterr().err
+    assert list(pd.read_csv("out/estimate.csv")["record"])[-2:] == ["c0", "c1"]
+    write(load_nasa_discharges("B0006")[3], Path("lab/c5.csv"))
+    assert main("calibrate lab --out out".split()) == 0
+    assert set(pd.read_csv("out/estimate.csv")["record"]) == {"c0", "c1", "c5"}
+    Path("lab/c5.csv").unlink()
+    for number in range(left, 2):
+        Path(f"c{number}.away").rename(f"lab/c{number}.csv")
+    assert main("calibrate lab --out out".split()) == 0
+    after = contents(pair / "out")
+    assert {name for name in before if after[name] != before[name]} == {"estimate.csv", "estimate.jsonl", "estimate.parquet"}
+    assert set(pd.read_csv("out/estimate.csv")["record"]) == {"c0", "c1", "c5"}
+
+
+STRANGERS = [b"", b"Dear all", b"{}", b"[]\n", bytes(100), b"\xff\n", b'{"format": "another"}\n{"row": 1}\n']
+
+
+@pytest.mark.parametrize("content", STRANGERS)
+def test_a_file_of_somebody_else_is_left_alone(content, quick, pair, capsys):
+    (pair / "out").mkdir()
+    run = pair / "out" / "estimate.jsonl"
+    run.write_bytes(content)
+    for more in ([], ["--force"]):
+        assert main(["calibrate", "lab", "--out", "out", *more]) == 2
+        assert "is no run of battery-calibrate: choose another --out, or move it" in capsys.readouterr().err
+        assert contents(pair / "out") == {"estimate.jsonl": content}
+    run.unlink()
+    assert main("calibrate lab --out out".split()) == 0
+    (pair / "out" / "c1_voltage.csv").unlink()
+    (pair / "out" / "life.png").write_bytes(content)
+    assert main("calibrate lab --out out".split()) == 0  # its own, whoever changed it
+
+
+def test_one_command_at_a_time_writes_to_a_folder(quick, pair, capsys):
+    with locked(Path("out/estimate.jsonl")):
+        for records in ("lab", "lab/c1.csv", "B0005:1"):
+            assert main(f"calibrate {records} --out out".split()) == 2
+            assert "is being written by another command: wait for it, or choose another --out" in capsys.readouterr().err
+    assert not contents(pair / "out") and main("calibrate lab/c1.csv --out out".split()) == 0
 
 
 @pytest.mark.parametrize("left", [b"", b'{"source": "', bytes(100), b"\xff\n", b"[]\n", b'{"source": 3}\n'])
-def test_what_a_power_cut_left_of_a_run_is_gone_on_from(left, lab, undisturbed, tmp_path, monkeypatch, capsys):
-    arguments = ["calibrate", *map(str, sorted(lab.iterdir())[:3]), "--out", str(tmp_path), "--table-only"]
+def test_what_a_power_cut_left_of_a_run_is_gone_on_from(left, quick, pair, monkeypatch):
+    arguments = "calibrate lab/c0.csv lab/c1.csv --out out --table-only".split()
     assert main(arguments) == 0
-    whole, run = (tmp_path / "estimate.csv").read_bytes(), tmp_path / "estimate.jsonl"
+    whole, run = Path("out/estimate.csv").read_bytes(), Path("out/estimate.jsonl")
     lines = run.read_bytes().splitlines(keepends=True)
-    run.write_bytes(b"".join(lines[:3]) + left)
-    (tmp_path / "estimate.csv").write_bytes(b"")
+    run.write_bytes(b"".join([*lines[:2], *lines[3:]]) + left)
+    Path("out/estimate.csv").write_bytes(b"")
     calls = []
-    monkeypatch.setattr(many, "calibrate", lambda *call, made=many.calibrate: calls.append(call) or made(*call))
+    monkeypatch.setattr(batch, "calibrate", lambda *call, made=batch.calibrate: calls.append(call) or made(*call))
     assert main(arguments) == 0
-    assert len(calls) == 1 and run.read_bytes().splitlines(keepends=True) == lines
-    assert (tmp_path / "estimate.csv").read_bytes() == whole
+    assert len(calls) == 1 and sorted(run.read_bytes().splitlines(keepends=True)) == sorted(lines)
+    assert Path("out/estimate.csv").read_bytes() == whole
 
 
-def test_a_run_is_gone_on_from_by_the_same_command_on_the_same_files_alone(lab, tmp_path, capsys):
-    records = [tmp_path / name for name in ("a.csv", "b.csv")]
-    for record, path in zip(load_nasa_discharges("B0006"), records, strict=False):
-        write(record, path)
-    out = tmp_path / "out"
-    arguments = ["calibrate", *map(str, records), "--out", str(out), "--table-only"]
+def test_a_file_that_has_changed_is_read_again(pair, capsys):
+    arguments = "calibrate lab --out out --table-only".split()
     assert main(arguments) == 0
-    for more, named in ((["--nominal", "2"], "nominal_Ah"), (["--isothermal"], "thermal"), (["--ignore", "x"], "ignore")):
-        capsys.readouterr()
-        assert main([*arguments, *more]) == 2
-        assert f"is of a command with another {named}; choose another --out, or give --force" in capsys.readouterr().err
-    write(load_nasa_discharges("B0006")[50], records[1])
+    before = pd.read_csv("out/estimate.csv")
+    write(load_nasa_discharges("B0006")[120], Path("lab/c1.csv"))
     assert main(arguments) == 0
-    shown = capsys.readouterr()
-    assert "going on: 1 discharges are done" in shown.err
-    again = pd.read_csv(out / "estimate.csv")
-    assert list(again["record"]) == ["a", "b"] and again["q_mobile_C"][1] < again["q_mobile_C"][0] - 500.0
-    assert main([*arguments, "--isothermal", "--force"]) == 0
-    (out / "estimate.jsonl").write_bytes(b"")
-    assert main(arguments) == 2 and "would be replaced" in capsys.readouterr().err
+    assert "going on: 1 discharges are done" in capsys.readouterr().err
+    again = pd.read_csv("out/estimate.csv")
+    assert list(again["record"]) == ["c0", "c1"] and again["q_mobile_C"][0] == before["q_mobile_C"][0]
+    assert again["q_mobile_C"][1] < before["q_mobile_C"][1] - 500.0
 
 
-HOSTILE = ["caf\udce9", "a$b$c", "$^{", "=cmd|x", "\x1b[31mred", "zelle_ü", "two\nlines"]
+def test_no_text_of_a_table_is_a_formula(pair, capsys):
+    record = load_nasa_discharges("B0005")[0]
+    for name in ("=1+1.csv", "+1.csv", "@SUM(A1).csv", "=HYPERLINK(0).csv.gz"):
+        write(record, pair / name)
+    cells = pd.concat([pd.read_csv("lab/c0.csv").assign(cell=cell) for cell in ("=1+2", "-3", "@x")])
+    cells.to_csv("=cells.csv", index=False)
+    Path("=broken.csv").write_text("nothing")
+    records = ["=1+1.csv", "+1.csv", "@SUM(A1).csv", "=HYPERLINK(0).csv.gz", "=cells.csv", "=broken.csv"]
+    assert main(["calibrate", *records, "--out", "out"]) == 2
+    table = pd.read_csv("out/estimate.csv")
+    texts = table.select_dtypes("object").stack()
+    assert len(table) == 8 and not texts[[isinstance(each, str) for each in texts]].str.match(r"[=+@-]").any()
+    assert all(Path(source).exists() for source in table["source"])
+    assert not any(name.startswith(("=", "+", "-", "@")) for name in contents(pair / "out"))
+    assert set(table["cell"]) >= {"_=1+2", "_-3", "_@x"}
+
+
+HOSTILE = ["caf\udce9", "a$b$^{c", "=cmd|x", "\x1b[31mred_ü", "two\nlines"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
@@ -190,12 +321,12 @@ def test_no_name_costs_a_row_or_a_picture_not_even_on_an_ascii_console(tmp_path)
         assert (out / f"{name}_voltage.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_cannot_be_drawn_or_written_beside_costs_no_row_and_is_made_by_the_same_command(lab, tmp_path, capsys):
+def test_what_cannot_be_written_beside_costs_no_row_and_is_made_by_the_same_command(lab, tmp_path, capsys):
     arguments = ["calibrate", f"{lab}/c1.csv", f"{lab}/c2.csv", "--out", str(tmp_path)]
     with a_full_disk(after_bytes=20_000):  # enough for the numbers
         assert main(arguments) == 0
     table = pd.read_csv(tmp_path / "estimate.csv")
-    assert table["settled"].all() and table["notes"].str.contains("voltage.png is not written: .*File too large").all()
+    assert table["settled"].all() and table["notes"].str.contains("voltage is not written: .*File too large").all()
     assert "life.png is not written: OSError" in capsys.readouterr().err
     assert main(arguments) == 0
     assert pd.read_csv(tmp_path / "estimate.csv")["notes"].isna().all()
@@ -245,15 +376,16 @@ def warned(number):
 
 def test_threads_do_not_take_each_others_warnings():
     with ThreadPoolExecutor(8) as pool:
-        for (number,), made in in_order(pool, 16, warned, [(n,) for n in range(64)]):
-            assert made == (number, [f"{number}.{step}" for step in range(3)], "")
+        made = [pool.submit(attempt, warned, n) for n in range(64)]
+        for number, each in enumerate(made):
+            assert each.result() == (number, [f"{number}.{step}" for step in range(3)], "")
     assert attempt(attempt, warned, 1).result == attempt(warned, 1)
 
 
 def test_any_executor_does(lab):
-    sources = many.find_sources([f"{lab}/c1.csv", f"{lab}/c2.csv", f"{lab}/c1.csv"])
+    sources = find_sources([f"{lab}/c1.csv", f"{lab}/c2.csv", f"{lab}/../{lab.name}/c1.csv"])
     with ThreadPoolExecutor(2) as pool:
-        found = list(many.calibrate_all(sources, many.FileFormat(), Settings(), executor=pool))
+        found = list(batch.calibrate_all(sources, batch.FileFormat(), Settings(), executor=pool))
     assert [each.record for each in found] == ["c1", "c2"] and np.ptp([each.found.q_mobile_C for each in found]) > 0.0
 
 

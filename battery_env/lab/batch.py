@@ -1,0 +1,593 @@
+"""
+Many discharges: each is read, calibrated and written for itself, on one core or many, and none that fails stops the others.
+The same command goes on from the rows that are written.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from importlib import resources
+from importlib.util import find_spec
+from pathlib import Path
+from types import FrameType
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import pandas as pd
+
+from battery_env.files import check_folder, check_new, locked, replacing
+from battery_env.lab.calibrate import calibrate
+from battery_env.lab.readers.columns import FileFormat
+from battery_env.lab.readers.discharges import Recording
+from battery_env.lab.report import METHOD_NAMES, Calibration, title_of
+from battery_env.lab.settings import Settings
+from battery_env.lab.sources import (
+    LIFE,
+    RUN,
+    TABLES,
+    VOLTAGE,
+    Source,
+    few_of,
+    find_sources,
+    is_bundled,
+    key_of,
+    no_formula,
+    printable,
+    read_source,
+    record_name,
+)
+
+__all__ = ["FileFormat", "Outcome", "Results", "Source", "calibrate_all", "find_sources", "read_source"]
+
+#: Of the package.
+VERSION = resources.files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
+
+_FORMAT = "battery_env.run"
+# Discharges that could not be used have no values there.
+_TYPES = {"cycle": "Int64", "settled": "boolean", "settled_q_mobile": "boolean", "settled_r_o": "boolean"}
+# A scheduler that is there answers within milliseconds.
+_PATIENCE_S = 5
+# Warnings belong to the process: threads that catch them take turns.
+_CATCHING = threading.RLock()
+
+_Call = TypeVar("_Call")
+
+
+class Terminated(KeyboardInterrupt):
+    """The process is asked to end: by a scheduler, a service, or a terminal that goes."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        #: What a shell says of a process that this signal ended
+        self.status = 128 + number
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let the signals that ask a process to end do what Ctrl-C does; those that somebody else handles are left to it."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise Terminated(number)
+
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if is_main and hasattr(signal, name)]
+    ours = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
+
+
+class InThisProcess(Executor):
+    """Makes each call at once."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Make a call."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class Processes(Executor):
+    """
+    Makes calls in processes of this machine, which end with this one. A call whose process is lost is made once more: each has
+    one to itself, so that it alone can be the reason.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._threads = ThreadPoolExecutor(count)
+        self._idle: list[ProcessPoolExecutor] = []
+        self._others = set(multiprocessing.active_children())
+        self._ends = False
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Make a call as soon as a process is free."""
+        return self._threads.submit(self._make, partial(fn, *args, **kwargs))
+
+    def _make(self, call: Callable[[], Any]) -> Any:
+        try:
+            return self._make_once(call)
+        except BrokenExecutor:
+            if self._ends:
+                raise
+            return self._make_once(call)
+
+    def _make_once(self, call: Callable[[], Any]) -> Any:
+        # spawn: torch does not survive a fork with threads
+        spawn = multiprocessing.get_context("spawn")
+        process = self._idle.pop() if self._idle else ProcessPoolExecutor(1, spawn, initializer=_end_with_parent)
+        future = process.submit(call)
+        if not isinstance(future.exception(), BrokenExecutor):
+            self._idle.append(process)
+        return future.result()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Wait for what is under way."""
+        self._threads.shutdown(wait, cancel_futures=cancel_futures)
+        for process in self._idle if wait else ():
+            process.shutdown()
+
+    def __exit__(self, *error: Any) -> None:
+        """What has not begun is not begun any more, and after an error what has begun is not waited for."""
+        if error[0] is not None:
+            self._ends = True
+            for process in set(multiprocessing.active_children()) - self._others:
+                process.terminate()
+        self.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """Leave Ctrl-C to the process that started this one, and end when that is gone, however that went."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+@contextmanager
+def workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
+    """What makes calls side by side: this process, so many of this machine (-1: one a core), or those of a Dask cluster."""
+    if scheduler is not None:
+        try:
+            from distributed import Client
+        except ImportError as error:
+            raise ImportError("--scheduler needs Dask: pip install 'battery_env[cluster]'") from error
+        try:
+            client = Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise OSError(f"no Dask scheduler at {scheduler!r}: {error}") from error
+        with client:
+            yield client.get_executor(pure=False)
+    else:
+        with InThisProcess() if jobs == 1 else Processes(jobs if jobs > 0 else os.cpu_count() or 1) as executor:
+            yield executor
+
+
+class Attempt(NamedTuple):
+    """What became of a call: its result, ``None`` after an error, its warnings, and the error, empty if there is none."""
+
+    result: Any
+    notes: list[str]
+    error: str
+
+
+def attempt(function: Callable[..., Any], *arguments: Any) -> Attempt:
+    """Make a call that stops no others, whatever becomes of it."""
+    result, error = None, ""
+    with _CATCHING, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")  # those for developers
+        warnings.simplefilter("always", UserWarning)
+        try:
+            result = function(*arguments)
+        except Exception as problem:
+            error = _message(problem)
+    return Attempt(result, [str(each.message) for each in caught], error)
+
+
+def _message(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    expected = (ValueError, TypeError, OSError, ImportError)
+    return text if isinstance(error, expected) and text else f"{type(error).__name__}: {text}"
+
+
+def _in_order(started: Iterable[tuple[_Call, Future[Attempt] | None]], ahead: int) -> Iterator[tuple[_Call, Attempt | None]]:
+    """
+    What became of calls, in the order in which they are started, each when at most so many others are under way. What needs no
+    call is passed on in its place.
+    """
+    waiting: deque[tuple[_Call, Future[Attempt] | None]] = deque()
+
+    def first() -> tuple[_Call, Attempt | None]:
+        call, future = waiting.popleft()
+        try:
+            return call, None if future is None else future.result()
+        except Exception as error:  # the worker's
+            return call, Attempt(None, [], _message(error))
+
+    for each in started:
+        waiting.append(each)
+        while waiting and (len(waiting) > ahead or (future := waiting[0][1]) is None or future.done()):
+            yield first()
+    while waiting:
+        yield first()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    What became of one discharge, or of a source that could not be read.
+
+    :param record: what it is called in results
+    :param source: file or bundled cell
+    :param cell: that of the source
+    :param cycle: number of the discharge; ``None`` if it has none
+    :param found: what it says; ``None`` if it could not be used
+    :param notes: warnings
+    :param error: why it could not be used, empty otherwise
+    """
+
+    record: str
+    source: str
+    cell: str
+    cycle: int | None
+    found: Calibration | None = None
+    notes: str = ""
+    error: str = ""
+
+    def row(self) -> dict[str, Any]:
+        """The columns of the table by name; no text is taken for a formula."""
+        told = {"record": self.record, "source": self.source, "cell": self.cell, "cycle": self.cycle}
+        row = told | (self.found.row() if self.found else {}) | {"notes": self.notes, "error": self.error}
+        return {name: no_formula(printable(value)) if isinstance(value, str) else value for name, value in row.items()}
+
+    @classmethod
+    def of_row(cls, row: Mapping[str, Any], settings: Settings) -> Outcome:
+        """The same, of a discharge that could be used."""
+        own = {field.name for field in fields(cls)}
+        columns = {name: value for name, value in row.items() if name not in own - {"cycle"}}
+        return cls(found=Calibration(settings, **columns), **{name: row[name] for name in own & row.keys()})
+
+
+class Results:
+    """
+    The files in a folder that results are written to. A row of the run is appended as each discharge is done, and whatever
+    ends the command, the same one goes on from there: one with the same arguments, settings and version. Rows of files that
+    are not there at the moment stay. What is there of another command, or of somebody else, is refused; of another command it
+    may be replaced.
+    """
+
+    def __init__(
+        self, folder: Path, sources: Sequence[Source], settings: Settings, file_format: FileFormat, with_voltages: bool = True
+    ) -> None:
+        self.folder, self.with_voltages, self._settings = folder, with_voltages, settings
+        self._stems = [record_name(source.stem, source.cycle) for source in sources]
+        is_one = len(sources) == 1 and _is_named(sources[0])
+        self._prefix = f"{self._stems[0]}_" if is_one else ""
+        self.run = folder / f"{self._prefix}{RUN}"
+        self._stamps = {source.key: _stamp(source) for source in sources}
+        read = sorted({key_of(source.given) for source in sources})
+        made_with = {**asdict(settings), **asdict(file_format), "sources": read, "voltages": with_voltages}
+        self._header: dict[str, Any] = json.loads(_json({"format": _FORMAT, "battery_env": VERSION, **made_with}))
+        self._rows: dict[tuple[str, int], dict[str, Any]] = {}
+        self._counts: dict[str, int] = {}
+        self._files: set[str] = set()
+        check_folder(folder)
+
+    @contextmanager
+    def opened(self, replace: bool) -> Iterator[Results]:
+        """Hold the folder against other commands, read what of the run is done, and refuse what may not be replaced."""
+        with locked(self.folder / RUN):
+            lines = self._read(replace)
+            others = [path for path in self._existing() if path.name not in self._files]
+            if others and not replace:
+                raise FileExistsError(
+                    f"{few_of(list(map(str, others)))} would be replaced; choose another --out, or give --force"
+                )
+            if others:
+                lines.append({"files": [path.name for path in others]})
+                self._files.update(path.name for path in others)
+            # Only what is whole: a power cut may have left a part of the last line
+            with replacing(self.run) as part:
+                part.write_text("".join(f"{_json(line)}\n" for line in (self._header, *lines)), encoding="ascii")
+            with self.run.open("ab") as self._stream:
+                yield self
+
+    def _read(self, replace: bool) -> list[dict[str, Any]]:
+        """The lines of this run that hold, but its header; none if there is no run."""
+        if not self.run.exists():
+            return []
+        lines = [_line(text) for text in self.run.read_bytes().splitlines()]
+        header = lines[0] if lines else {}
+        if header.get("format") != _FORMAT:
+            raise FileExistsError(f"{self.run} is no run of battery-calibrate: choose another --out, or move it elsewhere")
+        if replace:
+            return []
+        different = {name for name in header | self._header if header.get(name) != self._header.get(name)}
+        if different:
+            other = "battery_env" if "battery_env" in different else ", ".join(sorted(different - {"sources"}))
+            reads = f" that reads {few_of(header['sources'])}" if "sources" in header.keys() & different else ""
+            raise FileExistsError(
+                f"{self.run} is of a command{reads}{' with another ' if other else ''}{other}; choose another --out, or give "
+                "--force, which begins anew"
+            )
+        return [line for line in lines[1:] if self._takes(line)]
+
+    def _takes(self, line: dict[str, Any]) -> bool:
+        """Whether a line holds: of a file that is as it was, or not there."""
+        if "files" in line:
+            self._files.update(line["files"])
+            return True
+        if not line.get("whole") or self._stamps.get(line["source"]) not in (None, line["stamp"]):
+            return False
+        self._rows[line["source"], line["number"]] = line["row"]
+        self._counts[line["source"]] = line["of"]
+        return True
+
+    def _existing(self) -> list[Path]:
+        if not self.folder.is_dir():
+            return []
+        # the numbers of the discharges are not known before their files are read
+        stems = "|".join(map(re.escape, self._stems))
+        voltages = re.compile(rf"(?:{stems})(?:_\d+)*{VOLTAGE}\.(?:csv|png)", flags=re.IGNORECASE)
+        tables = {f"{self._prefix}{name}" for name in (*TABLES, LIFE)}
+        return [
+            path
+            for path in sorted(self.folder.iterdir())
+            if path.name in tables or (self.with_voltages and voltages.fullmatch(path.name))
+        ]
+
+    @property
+    def names(self) -> list[str]:
+        """What the discharges that are done are called."""
+        return [row["record"] for row in self._rows.values()]
+
+    @property
+    def absent(self) -> int:
+        """How many of these are of files that are not there."""
+        return sum(self._stamps.get(key) is None for key, _ in self._rows)
+
+    def of(self, source: Source, number: int) -> Outcome | None:
+        """What became of a discharge of a source, if that is done."""
+        row = self._rows.get((source.key, number))
+        return Outcome.of_row(row, self._settings) if row else None
+
+    def all_of(self, source: Source) -> list[Outcome]:
+        """What became of all discharges of a source; nothing unless all are done."""
+        found = [self.of(source, number) for number in range(self._counts.get(source.key, 0))]
+        return [each for each in found if each] if all(found) else []
+
+    def keep(self, outcome: Outcome, source: Source, number: int, count: int, whole: bool = True) -> None:
+        """Append a row, which is on the disk when this returns; one that is not whole is made again by the same command."""
+        key, row = source.key, outcome.row()
+        if not (outcome.error and (key, number) in self._rows):  # the file is gone since
+            self._rows[key, number] = row
+        described = {"source": key, "stamp": self._stamps[key], "number": number, "of": count}
+        self._append({**described, "whole": whole and not outcome.error, "row": row})
+
+    def _append(self, line: dict[str, Any]) -> None:
+        self._stream.write(f"{_json(line)}\n".encode("ascii"))
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+
+    def write(self, name: str, make: Callable[[Path], Any]) -> Path:
+        """Write a file of this run, which names it first. Of another's there is none of that name, or it is not touched."""
+        path, is_new = self.folder / name, name not in self._files
+        if is_new:
+            check_new(path)
+            self._append({"files": [name]})
+            self._files.add(name)
+        with replacing(path, new=is_new) as part:
+            make(part)
+        return path
+
+    def write_tables(self) -> list[Path]:
+        """Write the table of all rows of the run and, if several are whole, the figure of their parameters over them."""
+        order = {key: number for number, key in enumerate(self._stamps)}
+        keys = sorted(self._rows, key=lambda key: (order.get(key[0], len(order)), *key))
+        table = pd.DataFrame([self._rows[key] for key in keys]).astype(_TYPES)
+        written = [self.write(f"{self._prefix}{TABLES[0]}", partial(table.to_csv, index=False))]
+        more: dict[str, Callable[[Path], Any]] = {}
+        if find_spec("pyarrow") is not None:
+            more[TABLES[1]] = partial(table.to_parquet, engine="pyarrow", index=False)
+        whole = table[table["measured_eod_time_s"].notna()]
+        if len(whole) > 1:
+            more[LIFE] = partial(_draw_life, whole)
+        for name, make in more.items():
+            try:
+                written.append(self.write(f"{self._prefix}{name}", make))
+            except Exception as error:  # whatever it is, the numbers are written
+                path = self.folder / f"{self._prefix}{name}"
+                warnings.warn(f"{path} is not written: {type(error).__name__}: {error}", stacklevel=2)
+        return written
+
+    @property
+    def has_numbers(self) -> bool:
+        """Whether any discharge could be used."""
+        return any(not row["error"] for row in self._rows.values())
+
+
+def _draw_life(whole: pd.DataFrame, path: Path) -> None:
+    from battery_env.plotting import plot_life  # here, as matplotlib takes long to import
+
+    plot_life(whole).savefig(path, dpi="figure")
+
+
+def _is_named(source: Source) -> bool:
+    """Whether an argument named a source itself, and no folder, which may not be there at the moment."""
+    path = Path(source.path)
+    is_no_folder = is_bundled(source.path) or path.is_file() or (path.suffix != "" and not path.is_dir())
+    return is_no_folder and key_of(source.given) == source.key
+
+
+def _stamp(source: Source) -> list[Any] | None:
+    """What changes with the file, or with what its results are called; ``None`` if it is not there."""
+    if is_bundled(source.path):
+        return [source.stem, source.cell]
+    try:
+        status = os.stat(source.path)
+    except OSError:
+        return None
+    return [source.stem, source.cell, status.st_size, status.st_mtime_ns]
+
+
+def _json(content: Any) -> str:
+    """On one line, in ASCII, with numbers that come back to the bit."""
+    return json.dumps(content, default=lambda value: value.item() if isinstance(value, np.generic) else str(value))
+
+
+def _line(text: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+class _Place(NamedTuple):
+    """So many-th discharge of how many of a source, and what is known of it: all, if it is done."""
+
+    known: Outcome
+    source: Source
+    number: int
+    of: int
+    is_done: bool = False
+
+
+def calibrate_all(
+    sources: Sequence[Source],
+    file_format: FileFormat,
+    settings: Settings,
+    results: Results | None = None,
+    executor: Executor | None = None,
+    ahead: int = 64,
+) -> Iterator[Outcome]:
+    """
+    Calibrate the model to the discharges of many files.
+
+    :param sources: what to read
+    :param file_format: how
+    :param settings: of the calibration
+    :param results: files to write, opened; what is done there is not done again. ``None``: none
+    :param executor: what reads and calibrates, any of ``concurrent.futures`` or of Dask; ``None``: one after the other here
+    :param ahead: so many calls are under way at most beyond the one that is waited for, as each holds its data
+    :return: in the order of the sources
+    """
+    executor = executor or InThisProcess()
+    used = {name.casefold() for name in results.names} if results else set[str]()
+
+    def reads() -> Iterator[tuple[tuple[Source, list[Outcome]], Future[Attempt] | None]]:
+        for source in sources:
+            done = results.all_of(source) if results else []
+            yield (source, done), None if done else executor.submit(attempt, read_source, source, file_format)
+
+    def calls() -> Iterator[tuple[_Place, Future[Attempt] | None]]:
+        with_voltages = results is not None and results.with_voltages
+        for (source, done), read in _in_order(reads(), ahead):
+            for number, outcome in enumerate(done):
+                yield _Place(outcome, source, number, len(done), is_done=True), None
+            for place, recording in _places(source, read, results, used) if read else ():
+                if recording is None:
+                    yield place, None
+                else:
+                    name = place.known.record
+                    yield place, executor.submit(attempt, _calibrate, name, recording, settings, with_voltages)
+
+    for place, made in _in_order(calls(), ahead):
+        if place.is_done:
+            yield place.known
+            continue
+        outcome, whole = (place.known, True) if made is None else _outcome(place.known, made, results)
+        if results is not None:
+            results.keep(outcome, place.source, place.number, place.of, whole)
+        yield outcome
+
+
+def _places(
+    source: Source, read: Attempt, results: Results | None, used: set[str]
+) -> Iterator[tuple[_Place, Recording | None]]:
+    """The discharges of a source, each with what was recorded if it is to be calibrated; or the error of the source."""
+    recordings, notes, error = read
+    if error:
+        error = error if printable(source.path) in error else f"{source.path}: {error}"
+        name = _unused(record_name(source.stem, source.cycle), used)
+        yield _Place(Outcome(name, source.path, source.cell, source.cycle, None, "; ".join(notes), error), source, 0, 1), None
+        return
+    is_one = len({each.meta.get("cell") for each in recordings}) == 1
+    for number, recording in enumerate(recordings):
+        if results is not None and (outcome := results.of(source, number)):
+            yield _Place(outcome, source, number, len(recordings), is_done=True), None
+            continue
+        stem, cell, cycle = source.stem, source.cell, recording.meta.get("cycle")
+        if not is_one:  # a table of several cells names them
+            cell = recording.meta["cell"]
+            stem = "_".join((stem, *re.findall(r"[\w.-]+", cell)))
+        known = Outcome(_unused(record_name(stem, cycle), used), source.path, cell, cycle, notes="; ".join(notes))
+        yield _Place(known, source, number, len(recordings)), recording
+
+
+def _unused(name: str, used: set[str]) -> str:
+    """The name, with a number behind it if another record has it; some file systems take a letter and its capital for one."""
+    number, unused = 1, name
+    while unused.casefold() in used:
+        number += 1
+        unused = f"{name}_{number}"
+    used.add(unused.casefold())
+    return unused
+
+
+def _calibrate(name: str, recording: Recording, settings: Settings, with_voltages: bool) -> tuple[Calibration, Attempt]:
+    """What the discharge says, and its voltages as files by their suffixes."""
+    found = calibrate(recording.discharge(), settings)
+    files = attempt(_voltages_of, name, found) if with_voltages else Attempt({}, [], "")
+    return replace(found, record=None, forecast=None, end=None), files
+
+
+def _outcome(known: Outcome, made: Attempt, results: Results | None) -> tuple[Outcome, bool]:
+    """What became of a discharge, and whether all that belongs to it is written."""
+    if made.error:
+        return replace(known, error=f"{known.record}: {made.error}"), False
+    found, (files, _, lost) = made.result
+    for suffix, content in (files or {}).items():
+        assert results is not None
+        write = partial(Path.write_bytes, data=content)
+        lost = lost or attempt(results.write, f"{known.record}{VOLTAGE}.{suffix}", write).error
+    notes = [known.notes, *made.notes, f"{VOLTAGE[1:]} is not written: {lost}" if lost else ""]
+    return replace(known, found=found, notes="; ".join(filter(None, notes))), not lost
+
+
+def _voltages_of(name: str, found: Calibration) -> dict[str, bytes]:
+    """What one discharge showed, beside the model, as CSV and as PNG."""
+    from battery_env.plotting import literal, plot_discharge  # here, as matplotlib takes long to import
+
+    record, forecast = found.record, found.forecast
+    assert record is not None and forecast is not None
+    columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
+    table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False).encode()
+    picture = io.BytesIO()
+    models = {f"model, {METHOD_NAMES[found.method]}": forecast}
+    plot_discharge(record, models, title_of(literal(name), found), found.end).savefig(picture, dpi="figure")
+    return {"csv": table, "png": picture.getvalue()}
