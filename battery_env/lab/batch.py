@@ -361,24 +361,19 @@ class Results:
         ]
 
     @property
-    def names(self) -> list[str]:
-        """What the discharges that are done are called."""
-        return [row["record"] for row in self._rows.values()]
+    def done(self) -> list[Outcome]:
+        """What became of the discharges that are done, in the order of the sources."""
+        return [Outcome.of_row(row, self._settings) for row in self._sorted_rows()]
 
     @property
     def absent(self) -> int:
         """How many of these are of files that are not there."""
         return sum(self._stamps.get(key) is None for key, _ in self._rows)
 
-    def of(self, source: Source, number: int) -> Outcome | None:
-        """What became of a discharge of a source, if that is done."""
-        row = self._rows.get((source.key, number))
-        return Outcome.of_row(row, self._settings) if row else None
-
-    def all_of(self, source: Source) -> list[Outcome]:
-        """What became of all discharges of a source; nothing unless all are done."""
-        found = [self.of(source, number) for number in range(self._counts.get(source.key, 0))]
-        return [each for each in found if each] if all(found) else []
+    def holds(self, source: Source, number: int | None = None) -> bool:
+        """Whether a discharge of a source is done; without its number, whether all are."""
+        numbers = range(self._counts.get(source.key, 0)) if number is None else (number,)
+        return len(numbers) > 0 and all((source.key, each) in self._rows for each in numbers)
 
     def keep(self, outcome: Outcome, source: Source, number: int, count: int, whole: bool = True) -> None:
         """Append a row, which is on the disk when this returns; one that is not whole is made again by the same command."""
@@ -387,6 +382,11 @@ class Results:
             self._rows[key, number] = row
         described = {"source": key, "stamp": self._stamps[key], "number": number, "of": count}
         self._append({**described, "whole": whole and not outcome.error, "row": row})
+
+    def _sorted_rows(self) -> list[dict[str, Any]]:
+        order = {key: number for number, key in enumerate(self._stamps)}
+        keys = sorted(self._rows, key=lambda key: (order.get(key[0], len(order)), *key))
+        return [self._rows[key] for key in keys]
 
     def _append(self, line: dict[str, Any]) -> None:
         self._stream.write(f"{_json(line)}\n".encode("ascii"))
@@ -406,9 +406,7 @@ class Results:
 
     def write_tables(self) -> list[Path]:
         """Write the table of all rows of the run and, if several are whole, the figure of their parameters over them."""
-        order = {key: number for number, key in enumerate(self._stamps)}
-        keys = sorted(self._rows, key=lambda key: (order.get(key[0], len(order)), *key))
-        table = pd.DataFrame([self._rows[key] for key in keys]).astype(_TYPES)
+        table = pd.DataFrame(self._sorted_rows()).astype(_TYPES)
         written = [self.write(f"{self._prefix}{TABLES[0]}", partial(table.to_csv, index=False))]
         more: dict[str, Callable[[Path], Any]] = {}
         if find_spec("pyarrow") is not None:
@@ -468,13 +466,12 @@ def _line(text: bytes) -> dict[str, Any]:
 
 
 class _Place(NamedTuple):
-    """So many-th discharge of how many of a source, and what is known of it: all, if it is done."""
+    """So many-th discharge of how many of a source, and what is known of it before it is calibrated."""
 
     known: Outcome
     source: Source
     number: int
     of: int
-    is_done: bool = False
 
 
 def calibrate_all(
@@ -494,59 +491,51 @@ def calibrate_all(
     :param results: files to write, opened; what is done there is not done again. ``None``: none
     :param executor: what reads and calibrates, any of ``concurrent.futures`` or of Dask; ``None``: one after the other here
     :param ahead: so many calls are under way at most beyond the one that is waited for, as each holds its data
-    :return: in the order of the sources
+    :return: in the order of the sources, but first what is done
     """
     executor = executor or InThisProcess()
-    used = {name.casefold() for name in results.names} if results else set[str]()
-
-    def reads() -> Iterator[tuple[tuple[Source, list[Outcome]], Future[Attempt] | None]]:
-        for source in sources:
-            done = results.all_of(source) if results else []
-            yield (source, done), None if done else executor.submit(attempt, read_source, source, file_format)
+    with_voltages = results is not None and results.with_voltages
+    done = results.done if results else []
+    yield from done
+    used = {each.record.casefold() for each in done}
+    to_read = [source for source in sources if not (results and results.holds(source))]
+    reads = ((source, executor.submit(attempt, read_source, source, file_format)) for source in to_read)
 
     def calls() -> Iterator[tuple[_Place, Future[Attempt] | None]]:
-        with_voltages = results is not None and results.with_voltages
-        for (source, done), read in _in_order(reads(), ahead):
-            for number, outcome in enumerate(done):
-                yield _Place(outcome, source, number, len(done), is_done=True), None
-            for place, recording in _places(source, read, results, used) if read else ():
+        for source, read in _in_order(reads, ahead):
+            for place, recording in _places(source, read, used):
+                name = place.known.record
                 if recording is None:
                     yield place, None
-                else:
-                    name = place.known.record
+                elif not (results and results.holds(source, place.number)):
                     yield place, executor.submit(attempt, _calibrate, name, recording, settings, with_voltages)
 
     for place, made in _in_order(calls(), ahead):
-        if place.is_done:
-            yield place.known
-            continue
-        outcome, whole = (place.known, True) if made is None else _outcome(place.known, made, results)
+        outcome, whole = (place.known, False) if made is None else _outcome(place.known, made, results)
         if results is not None:
             results.keep(outcome, place.source, place.number, place.of, whole)
         yield outcome
 
 
-def _places(
-    source: Source, read: Attempt, results: Results | None, used: set[str]
-) -> Iterator[tuple[_Place, Recording | None]]:
-    """The discharges of a source, each with what was recorded if it is to be calibrated; or the error of the source."""
-    recordings, notes, error = read
-    if error:
-        error = error if printable(source.path) in error else f"{source.path}: {error}"
+def _places(source: Source, read: Attempt | None, used: set[str]) -> Iterator[tuple[_Place, Recording | None]]:
+    """The discharges of a source, each with what was recorded; or the error of the source, without."""
+    assert read is not None
+    if read.error:
+        error = read.error if printable(source.path) in read.error else f"{source.path}: {read.error}"
         name = _unused(record_name(source.stem, source.cycle), used)
-        yield _Place(Outcome(name, source.path, source.cell, source.cycle, None, "; ".join(notes), error), source, 0, 1), None
+        known = Outcome(name, source.path, source.cell, source.cycle, notes="; ".join(read.notes), error=error)
+        yield _Place(known, source, 0, 1), None
         return
-    is_one = len({each.meta.get("cell") for each in recordings}) == 1
-    for number, recording in enumerate(recordings):
-        if results is not None and (outcome := results.of(source, number)):
-            yield _Place(outcome, source, number, len(recordings), is_done=True), None
-            continue
+    is_one = len({each.meta.get("cell") for each in read.result}) == 1
+    for number, recording in enumerate(read.result):
         stem, cell, cycle = source.stem, source.cell, recording.meta.get("cycle")
         if not is_one:  # a table of several cells names them
             cell = recording.meta["cell"]
             stem = "_".join((stem, *re.findall(r"[\w.-]+", cell)))
-        known = Outcome(_unused(record_name(stem, cycle), used), source.path, cell, cycle, notes="; ".join(notes))
-        yield _Place(known, source, number, len(recordings)), recording
+        name = _unused(record_name(stem, cycle), used)
+        yield _Place(
+            Outcome(name, source.path, cell, cycle, notes="; ".join(read.notes)), source, number, len(read.result)
+        ), recording
 
 
 def _unused(name: str, used: set[str]) -> str:
