@@ -386,11 +386,9 @@ def _calibrate(
     states: Counter[str] = Counter()
     first: Outcome | None = None
     interrupted = None
-    if results and results.names:
+    if results and (done := len(results.done)):
         absent = f", {results.absent} of them of files that are not there now" if results.absent else ""
-        print(
-            f"going on: {len(results.names)} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True
-        )
+        print(f"going on: {done} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True)
     try:
         with workers(options.jobs, options.scheduler) as executor:
             ahead = 64 if options.scheduler or options.jobs == -1 else 2 * options.jobs
