@@ -220,7 +220,7 @@ def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
 
 def _goes_on(part: _LoadedPart, load: LoadToCome | None) -> bool:
     """Whether a record is in progress at a constant load, as far as is known for ever."""
-    is_over = float(part.discharge.time_s[-1] - part.loaded.time_s[-1]) > _REST_S
+    is_over = float(part.discharge.time_s[-1] - part.loaded.time_s[-1]) > STEADY_S
     return part.in_progress and load is None and not part.load.varied and not is_over
 
 

@@ -16,7 +16,7 @@ from battery_env import Calibration, Discharge, LeastSquares, PolicyEstimator, S
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.model_error import memory_share
 from battery_env.estimators.cell_fit import read_cell
-from battery_env.estimators.diagnosis.conditions import Condition
+from battery_env.estimators.reasons import Reason
 from battery_env.lab import batch
 from battery_env.lab.calibrate import calibrate as calibrated
 from battery_env.lab.command_line import main
@@ -341,7 +341,7 @@ def test_no_capacity_is_stated_where_the_cell_did_not_start_full(first, more, re
 def test_a_doubt_about_the_start_stands_behind_the_estimates_own_reason_and_is_one_about_the_charge(load_A):
     record = simulate(np.full(20_000, load_A), 6000.0, 0.2, load_unit="current", thermal=True, cut_off_V=2.65)
     stated, unknown = (battery_env.calibrate(seen(record, slice(None)), initial_soc=each) for each in (1.0, "rest"))
-    assert unknown.reason == f"{stated.reason} {Condition.START_UNKNOWN.text}".strip()
+    assert unknown.reason == f"{stated.reason} {Reason.START_UNKNOWN.text}".strip()
     assert not unknown.settled and not unknown.settled_q_mobile and unknown.settled_r_o == stated.settled_r_o
     assert unknown.r_o_ohm == pytest.approx(0.2, rel=0.01) and np.isnan(unknown.capacity_Ah)
 
