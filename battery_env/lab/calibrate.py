@@ -202,7 +202,8 @@ def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
     if settings.initial_soc == "rest":
         start = soc_from_rest(discharge, cell, settings.mismatch_V)
     else:
-        start = Start(*check_initial_soc(settings.initial_soc))
+        soc, sd_soc = check_initial_soc(settings.initial_soc)
+        start = Start(soc, sd_soc)
     return _LoadedPart(
         discharge=discharge,
         loaded=loaded,

@@ -66,7 +66,9 @@ def find_sources(arguments: Iterable[str]) -> list[Source]:
     sources = []
     for argument in arguments:
         if inside.get(argument):
-            sources += [Source(str(file), None, *_names(file, folders), argument) for file in inside[argument]]
+            for file in inside[argument]:
+                stem, cell = _names(file, folders)
+                sources.append(Source(str(file), None, stem, cell, argument))
             continue
         name, colon, cycle = argument.rpartition(":")
         if not (colon and cycle.isdecimal()) or Path(argument).exists():
