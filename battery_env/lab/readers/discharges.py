@@ -17,11 +17,20 @@ import pandas as pd
 from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import LOAD_LIMITS
 from battery_env.lab.readers.columns import FileFormat, Recognised, find_columns, say
-from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, cells_of, rows_of_cell
+from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, SOME_SHARE, cells_of, rows_of_cell
 from battery_env.lab.readers.signs import MUCH_SHARE, with_signed_current
 from battery_env.lab.readers.tables import check_mat, open_frame, read_columns
 from battery_env.lab.readers.testers import Tester, find_tester
-from battery_env.records import LEAST_LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE, ChargeBefore, ChargeHistory, drawn
+from battery_env.records import (
+    LEAST_LOAD_SHARE,
+    LOAD_SHARE,
+    REST_CURRENT_A,
+    SWITCH_SHARE,
+    ChargeBefore,
+    ChargeHistory,
+    drawn,
+    is_load,
+)
 from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES, Discharge, read_nasa_mat
 
 Made = TypeVar("Made")
@@ -242,13 +251,13 @@ def _bounds(rows: pd.DataFrame) -> list[int]:
     time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
     # a cycle may draw little beside others
     most_A = rows["current"].abs().groupby(rows["cycle"]).transform("max").to_numpy()
-    switch_A = SWITCH_SHARE * np.maximum(most_A, min(REST_CURRENT_A / SWITCH_SHARE, most_A.max()))
+    load_A = LOAD_SHARE * np.maximum(most_A, min(REST_CURRENT_A / LOAD_SHARE, most_A.max()))
     lowest_V = voltage_V.min()
     charged = np.zeros(len(rows), dtype=np.bool_)
     for start, end, _, is_braking in _charges(current_A, _passed_C(time_s, current_A)):
-        charged[start:end] = not is_braking and (current_A[start:end] < -switch_A[start:end]).any()
+        charged[start:end] = not is_braking and (current_A[start:end] < -load_A[start:end]).any()
     n = np.arange(len(rows))
-    loads = charged | (current_A > switch_A)
+    loads = charged | (current_A > load_A)
     # of each row the last one under load or charge before it, the next one from it on, and the last one of a charge
     before = np.maximum.accumulate(np.append(-1, np.where(loads, n, -1)[:-1]))
     after = np.minimum.accumulate(np.where(loads, n, len(rows))[::-1])[::-1]
@@ -299,10 +308,10 @@ def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[tuple[slice, fl
     for begin, end in found:
         own = list(itertools.takewhile(lambda each, end=end: each[0] < end, charges))  # type: ignore[misc]
         charges = charges[len(own) :]
-        peak_A = current_A[begin:end].max()
-        if not peak_A > 0.0:
+        loaded = is_load(current_A[begin:end])
+        if not loaded.any():
             continue
-        first = begin + int(np.argmax(current_A[begin:end] > SWITCH_SHARE * peak_A))
+        first = begin + int(loaded.argmax())
         drawn_C = float(passed_C[first:end].max() - passed_C[first])
         for start, stop, _, is_braking in own:
             is_before = begin <= start and stop <= (first if is_braking else end)
@@ -325,20 +334,20 @@ def _charge_before(rows: pd.DataFrame, not_charging: IntArray, begin: int) -> Ch
 def _load_on_s(rows: pd.DataFrame, stretch: slice) -> float | None:
     """When the load of a discharge came on, if its first row says how long ago that was, or how much was drawn since."""
     time_s, current_A = (rows[name].to_numpy() for name in ("time", "current"))
-    n = stretch.start + int(np.argmax(current_A[stretch] > SWITCH_SHARE * current_A[stretch].max()))
+    n = stretch.start + int(is_load(current_A[stretch]).argmax())
     if not 0 < n < len(rows) - 1:
         return None
     interval_s, ago_s, teller = time_s[n] - time_s[n - 1], np.inf, ""
     if "capacity" in rows:
         (on_C, next_C), now_C = np.diff(rows["capacity"].iloc[n - 1 : n + 2]), rows["capacity"].iloc[n]
-        if abs(abs(next_C) / current_A[n] - (time_s[n + 1] - time_s[n])) <= SWITCH_SHARE * (time_s[n + 1] - time_s[n]):
+        if abs(abs(next_C) / current_A[n] - (time_s[n + 1] - time_s[n])) <= SOME_SHARE * (time_s[n + 1] - time_s[n]):
             # a counter may start anew with each step
             ago_s, teller = abs(on_C if on_C * next_C >= 0.0 else now_C) / current_A[n], "the count of the tester"
     if "step_time" in rows:
         step_s, later_s = rows["step_time"].iloc[n : n + 2]
         ago_s, teller = (step_s, "the time in its step") if 0.0 <= step_s < later_s else (ago_s, teller)
     # the two clocks need not agree to the last digit, nor a count of few digits
-    if not ago_s <= (1.0 + SWITCH_SHARE) * interval_s:
+    if not ago_s <= (1.0 + SOME_SHARE) * interval_s:
         return None
     told_s = max(float(time_s[n] - ago_s), float(time_s[n - 1]))
     if interval_s > 2.0 * max(time_s[n + 1] - time_s[n], time_s[n - 1] - time_s[max(n - 2, 0)]):
@@ -355,7 +364,7 @@ def _recording(
     if has_own_clock and history.load_on_s is not None:
         history = history._replace(load_on_s=history.load_on_s - float(time_s[0]))
     if "cycle" in rows:
-        meta["cycle"] = int(rows["cycle"].iloc[int(np.argmax(current_A > SWITCH_SHARE * current_A.max()))])
+        meta["cycle"] = int(rows["cycle"].iloc[int(is_load(current_A).argmax())])
     # dates of this century are more than a billion seconds after 1970, and a clock is none
     if "date" in rows and rows["date"].iloc[0] > 1e9:
         begin = datetime.fromtimestamp(float(rows["date"].iloc[0]), tz=timezone.utc)
@@ -378,7 +387,7 @@ def _recording(
 def _with_count(history: ChargeHistory, rows: pd.DataFrame, stated: frozenset[str]) -> ChargeHistory:
     """With how much the charge under load is another one than the tester counted row by row, or than a clock lost."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
-    loaded = np.flatnonzero(current_A > SWITCH_SHARE * current_A.max())
+    loaded = np.flatnonzero(is_load(current_A))
     if not len(loaded):  # of values that no cell has, which are refused later
         return history
     part = slice(loaded[0], loaded[-1] + 1)
@@ -402,7 +411,7 @@ def _with_count(history: ChargeHistory, rows: pd.DataFrame, stated: frozenset[st
         counted_Ah, passed_Ah = counted_C / 3600.0, (counted_C + off_C) / 3600.0
         told = f"the tester counted {counted_Ah:.4g} Ah, where current and time make {passed_Ah:.4g} Ah"
         for unit, (symbol, tick_s) in CLOCKS.items() if "time" not in stated else ():
-            if tick_s != 1.0 and abs(counted_Ah / passed_Ah - tick_s) <= SWITCH_SHARE * tick_s:
+            if tick_s != 1.0 and abs(counted_Ah / passed_Ah - tick_s) <= SOME_SHARE * tick_s:
                 raise ValueError(f"{told}, as if the clock counts {unit}: --units time={symbol}")
         say(f"{told}: check units and clock, and that all rows are there")
     return history._replace(is_counted=is_counted, uncounted_C=abs(off_C))
@@ -438,6 +447,6 @@ def _filled(time_s: FloatArray, temperature_C: FloatArray) -> FloatArray | None:
     if not known.any():
         return None
     gap_s = float(np.diff([time_s[0], *time_s[known], time_s[-1]]).max())
-    if gap_s > SWITCH_SHARE * np.ptp(time_s):
+    if gap_s > SOME_SHARE * np.ptp(time_s):
         warnings.warn(f"the temperature is missing for up to {gap_s:.0f} s, and interpolated", stacklevel=2)
     return np.interp(time_s, time_s[known], temperature_C[known])

@@ -18,13 +18,15 @@ from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import LOAD_LIMITS, ZERO_CELSIUS_K
 from battery_env.lab.readers.columns import Column, FileFormat, direction, say
 from battery_env.lab.readers.testers import REQUIRED
-from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
+from battery_env.records import LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE
 from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES
 
 #: What is worth less than this share of the charge is nothing.
 NOTHING_SHARE = 1e-3
 #: Of so few rows, or of so little charge, a record can do without.
 FEW_SHARE = 0.01
+#: Two clocks, or a clock and a counter, agree within this share; of no more rows a value may be missing, or wild.
+SOME_SHARE = 0.1
 # Two rows of different steps may have the same time; the second counts as so much later, s.
 _STEP_S = 1e-3
 # Temperatures that a cell may have, degC.
@@ -120,7 +122,7 @@ def numbers(values: pd.Series, column: Column) -> FloatArray:
 def _check_readable(values: pd.Series, is_missing: pd.Series, column: Column, what: str) -> None:
     text = values[is_missing & values.notna()].astype(str).str.strip()
     bad = text[text != ""]
-    if len(bad) > SWITCH_SHARE * values.notna().sum():
+    if len(bad) > SOME_SHARE * values.notna().sum():
         advice, thousands = "", bad[bad.str.match(_THOUSANDS)]
         if len(thousands):
             advice, bad = ". Write numbers without separators of thousands", thousands
@@ -250,7 +252,7 @@ def _tests_apart(rows: pd.DataFrame) -> pd.DataFrame:
     if "cycle" in rows or "current" not in rows or not len(n):
         return rows
     size_A = rows["current"].abs().to_numpy()
-    if (np.maximum(size_A[n], size_A[n - 1]) > min(REST_CURRENT_A, SWITCH_SHARE * np.nanmax(size_A))).any():
+    if (np.maximum(size_A[n], size_A[n - 1]) > min(REST_CURRENT_A, LOAD_SHARE * np.nanmax(size_A))).any():
         return rows
     test = np.isin(np.arange(len(rows)), n)
     say(f"the clock starts anew at rest, where another test begins: row {place_of(rows, test)}")
@@ -339,7 +341,7 @@ def without_incomplete(rows: pd.DataFrame) -> pd.DataFrame:
         inside = ~kept & (n > at[0]) & (n < at[-1])
         worth_C = np.where(inside, np.abs(given_A - beside_A) * np.abs(np.gradient(time_s)), 0.0)
         is_known_enough = worth_C.sum() / 3.0**0.5 <= FEW_SHARE * _passed_C(rows[kept])
-        is_known_enough &= (is_measured & ~kept).sum() <= SWITCH_SHARE * len(rows)
+        is_known_enough &= (is_measured & ~kept).sum() <= SOME_SHARE * len(rows)
     for name, is_known in known.items():
         bad = ~is_known & is_measured
         if bad.any() and not is_known_enough:
@@ -357,7 +359,7 @@ def without_incomplete(rows: pd.DataFrame) -> pd.DataFrame:
 
 def without_dead_ends(rows: pd.DataFrame) -> pd.DataFrame:
     """Without rows at the ends in which no cell was connected."""
-    dead = (rows["voltage"] < SWITCH_SHARE * rows["voltage"].median()) & (rows["current"].abs() <= REST_CURRENT_A)
+    dead = (rows["voltage"] < SOME_SHARE * rows["voltage"].median()) & (rows["current"].abs() <= REST_CURRENT_A)
     ends = dead & (dead.cummin() | dead[::-1].cummin())
     if not ends.any() or ends.all():
         return rows
@@ -422,7 +424,7 @@ def _refuse_backwards(rows: pd.DataFrame, step_s: FloatArray) -> None:
             "Where it starts anew with each step it is the time in a step, not of the test: --columns step_time=NAME. Where "
             "another test begins number the tests in a column of the cycle, or give each a file"
         )
-    elif abs(step_s[n] + 3600.0) <= (1.0 + SWITCH_SHARE) * max(float(np.median(step_s)), float(step_s[n - 1])):
+    elif abs(step_s[n] + 3600.0) <= (1.0 + SOME_SHARE) * max(float(np.median(step_s)), float(step_s[n - 1])):
         advice = "Clocks are put back by an hour in autumn: give times of UTC"
     else:
         advice = "Sort the rows by time, or remove those"

@@ -11,7 +11,7 @@ import pandas as pd
 from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.lab.readers.columns import Column, Recognised
 from battery_env.lab.readers.rows import NOTHING_SHARE
-from battery_env.records import REST_CURRENT_A, SWITCH_SHARE
+from battery_env.records import LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE
 
 # How plain the sign of the current must be, of -1 to 1.
 _CLEAR = 0.5
@@ -57,7 +57,7 @@ class _Stretches(NamedTuple):
 def with_signed_current(rows: pd.DataFrame, known: Recognised, is_negative: bool | None) -> pd.DataFrame:
     """The current of a discharge is positive."""
     current_A = rows["current"]
-    rest_A = min(REST_CURRENT_A, SWITCH_SHARE * float(current_A.abs().max()))
+    rest_A = min(REST_CURRENT_A, LOAD_SHARE * float(current_A.abs().max()))
     if not current_A.any():
         raise ValueError("no current flows in any row: there is no discharge")
     if current_A.abs().max() <= REST_CURRENT_A and not np.ptp(rows["voltage"][current_A.abs() > rest_A]) > _COIN_FALL_V:
