@@ -17,7 +17,7 @@ def train_nothing(monkeypatch) -> Callable[[ModuleType], list[tuple]]:
 
         def train_or_load(recipe, folder, callbacks=(), compile_update=False):
             asked.append((recipe.algo, recipe.env_id, recipe.seed, recipe.timesteps))
-            write_json(record_file(recipe, folder), {"training_minutes": 1.5})
+            write_json(record_file(recipe, folder), {"training_minutes": 1.5, "versions": {}})
             settings = {"buffer_size": 10, "policy_kwargs": {"net_arch": [8]}}
             model = LAC("MlpPolicy", recipe.env_id, device="cpu", seed=recipe.seed, **settings)
             for callback in callbacks:

@@ -5,6 +5,8 @@ import json
 import pandas as pd
 import pytest
 
+from battery_env import TrajectoryDataset
+from battery_env.loads import RandomPiecewise
 from battery_env.policies.pretrained import policy_of_file
 from benchmarks import pretrained
 from benchmarks.training import record_file
@@ -21,12 +23,19 @@ def train_briefly(monkeypatch):
         assert recipe.algo == "lac" and options == {**pretrained.TRAINED_WITH, **recorded}
         record = record_file(recipe, folder)
         record.parent.mkdir(parents=True, exist_ok=True)
-        record.write_text(json.dumps({"training_minutes": 1.0}))
+        record.write_text(json.dumps({"training_minutes": 1.0, "versions": {}}))
         env = pretrained.PolicyEstimator.environment(recipe.env_id, **pretrained.OPTIONS)
         return LAC("MlpPolicy", env, device="cpu", buffer_size=10, seed=recipe.seed, policy_kwargs={"net_arch": [8]})
 
     monkeypatch.setattr(pretrained, "train_or_load", train_or_load)
     monkeypatch.setattr(pretrained, "MISMATCHES", (0.0, 0.2))
+    # not a thousand discharges of each mismatch
+    monkeypatch.setattr(pretrained, "standard_dataset", lambda parameters, load, split, mismatch: few(parameters, mismatch))
+
+
+def few(parameters, mismatch):
+    ranges = {"q_mobile_range": (4000.0, 7600.0), "r_o_range": (0.1, 0.3)}
+    return TrajectoryDataset.generate(parameters, 2, RandomPiecewise(), seed=0, mismatch=mismatch, **ranges)
 
 
 def test_it_writes_policies_with_their_cards_and_those_for_recorded_cells_beside_them(train_briefly, tmp_path, capsys):
