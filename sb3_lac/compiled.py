@@ -3,6 +3,7 @@
 import inspect
 import math
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -138,8 +139,8 @@ class Graph:
         self._function = function
         self._sampled = sampled
         self._on_gpu = on_gpu
-        self._inputs: list[th.Tensor] = []
-        # Where parts of samples are among the inputs, and which of them
+        # All but parts of samples, and where those are among them
+        self._inputs: list[th.Tensor | None] = []
         self._parts: dict[int, int] = {}
         self._addresses: list[int] = []
         self._cuda_graph: th.cuda.CUDAGraph | None = None
@@ -148,41 +149,48 @@ class Graph:
 
     def __call__(self, *inputs: th.Tensor) -> Sequence[th.Tensor]:
         """As PyTorch calls it, after it has checked that the code is still that of the update."""
-        self._inputs = list(inputs)
         known = {id(part): index for index, part in enumerate(self._sampled)}
         self._parts = {at: known[id(each)] for at, each in enumerate(inputs) if id(each) in known}
-        return self._run()
+        self._inputs = [None if at in self._parts else each for at, each in enumerate(inputs)]
+        # A number that is read from the processor would be the same in each replay
+        self._on_gpu = self._on_gpu and all(each.is_cuda for each in inputs)
+        return self._run(inputs)
 
     def again(self, sampled: Sequence[th.Tensor]) -> th.Tensor:
         """Run on other samples of the same form, without that check, and return the one output, the metrics."""
+        inputs: list[Any] = self._inputs.copy()
         for at, index in self._parts.items():
-            self._inputs[at] = sampled[index]
-        (metrics,) = self._run()
+            inputs[at] = sampled[index]
+        (metrics,) = self._run(inputs)
         return metrics
 
-    def _run(self) -> Sequence[th.Tensor]:
+    def _run(self, inputs: Sequence[th.Tensor]) -> Sequence[th.Tensor]:
         if not self._on_gpu:
-            return self._function(*self._inputs)
-        addresses = [each.data_ptr() for at, each in enumerate(self._inputs) if at not in self._parts]
+            return self._function(*inputs)
+        addresses = [each.data_ptr() for at, each in enumerate(inputs) if at not in self._parts]
         if addresses != self._addresses:
             self._addresses, self._cuda_graph = addresses, None
-            return self._function(*self._inputs)
+            return self._function(*inputs)
         if self._cuda_graph is None:
-            self._capture()
-        th._foreach_copy_(self._copies, [self._inputs[at] for at in self._parts])
+            try:
+                self._cuda_graph = self._capture(inputs)
+            except RuntimeError as error:
+                warnings.warn(f"The update is not replayed as a CUDA graph, and slower: {error}", stacklevel=2)
+                self._on_gpu = False
+                return self._function(*inputs)
+        th._foreach_copy_(self._copies, [inputs[at] for at in self._parts])
         self._cuda_graph.replay()
         # The next replay overwrites them
         return [output.clone() for output in self._outputs]
 
-    def _capture(self) -> None:
+    def _capture(self, inputs: Sequence[th.Tensor]) -> th.cuda.CUDAGraph:
         """Record what the GPU is to do, without doing it."""
-        inputs = self._inputs.copy()
-        for at in self._parts:
-            inputs[at] = inputs[at].clone()
-        self._copies = [inputs[at] for at in self._parts]
-        self._cuda_graph = th.cuda.CUDAGraph()
-        with th.cuda.graph(self._cuda_graph):
-            self._outputs = self._function(*inputs)
+        static = [each.clone() if at in self._parts else each for at, each in enumerate(inputs)]
+        self._copies = [static[at] for at in self._parts]
+        cuda_graph = th.cuda.CUDAGraph()
+        with th.cuda.graph(cuda_graph):
+            self._outputs = self._function(*static)
+        return cuda_graph
 
 
 class CompiledUpdate:

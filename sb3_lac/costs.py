@@ -134,8 +134,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if self.compile_update:
             self._compiled = CompiledUpdate(type(self)._update, self.device)
 
-        self.largest_reward.fill_(self.reward_bound or 0.0)
-        self.update_offset(self._vec_normalize_env)
+        self.raise_bound(0.0)
 
     def _setup_lr_schedule(self) -> None:
         super()._setup_lr_schedule()
@@ -217,6 +216,12 @@ class CostAlgorithm(OffPolicyAlgorithm):
             return bound
         return (bound / reward_scale(vec_normalize)).clamp(max=vec_normalize.clip_reward)
 
+    def raise_bound(self, reward: float | th.Tensor) -> None:
+        """Let the bound be at least a reward of the environment, and the one that is stated, and tell the critics."""
+        self.largest_reward.copy_(self.cost_bound().clamp(min=reward))
+        # The scale of the rewards may have changed too
+        self.update_offset(self._vec_normalize_env)
+
     def update_offset(self, vec_normalize: VecNormalize | None) -> None:
         """Give the critics the value of ``L`` where nothing is ever paid."""
         bound = self.cost_bound(vec_normalize)
@@ -264,8 +269,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
                     "shown as infinite. Use for instance gamma=0.99.",
                     stacklevel=2,
                 )
-            self.largest_reward.fill_(float(paid.max()))
-            self.update_offset(vec_normalize)
+            self.raise_bound(float(paid.max()))
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def costs(self, replay_data: Samples) -> th.Tensor:
@@ -277,9 +281,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         n_rewards = 1.0 if replay_data.discounts is None else (1 - replay_data.discounts) / (1 - self.gamma)
         largest_reward = (replay_data.rewards / n_rewards).max()
         vec_normalize = self._vec_normalize_env
-        self.largest_reward.copy_(th.maximum(self.cost_bound(), largest_reward * reward_scale(vec_normalize)))
-        # The scale of the rewards may have changed too
-        self.update_offset(vec_normalize)
+        self.raise_bound(largest_reward * reward_scale(vec_normalize))
         # Changes of the units round
         bound = th.maximum(self.cost_bound(vec_normalize), largest_reward)
         return bound * n_rewards - replay_data.rewards
@@ -419,7 +421,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         # Its limits may be others than those of the file
         model._project_lambda()
         if model.env is not None and {"gamma", "reward_bound"} & {*kwargs, *(kwargs.get("custom_objects") or ())}:
-            model.update_offset(model._vec_normalize_env)
+            model.raise_bound(0.0)
         return model
 
     def _excluded_save_params(self) -> list[str]:

@@ -13,8 +13,8 @@ from benchmarks import (
     direct_mapping,
     linear_cost,
     published,
+    speed,
     stabilisation,
-    throughput,
 )
 from benchmarks.study import markdown
 
@@ -45,7 +45,7 @@ REPORTS = {
     "published_horizons/published": partial(of_one, published.report, "published"),
     "stabilisation/stabilisation": stabilisation.report,
     "stabilisation_long/stabilisation": stabilisation.report,
-    "throughput/filters": partial(of_one, throughput.report_filters, "filters"),
+    "throughput/filters": partial(of_one, speed.report_filters, "filters"),
     **{f"{name}/{name}": partial(of_comparison, name) for name in ("faults", "mismatch", "peers")},
 }
 

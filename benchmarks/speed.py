@@ -1,18 +1,22 @@
 """
-How many steps a second the model makes, beside NASA's progpy; how many the environments make, for one cell and for many; and
-how long an update of a filter and of a policy takes, beside progpy's filters.
+Updates a second of LAC, compiled and not, beside SAC of Stable-Baselines3 and of SBX (JAX), and what a GPU is worth; how many
+steps a second the battery model and the environments make, and how long an update of a filter and of a policy takes, beside
+NASA's progpy.
 
 .. code-block:: bash
 
-  python -m benchmarks.throughput
-  python -m benchmarks.throughput --only filters
+  python -m benchmarks.speed
+  python -m benchmarks.speed --only updates
+  python -m benchmarks.speed --only gpu --rounds 10
 
 Contestants take turns in short blocks, so that whatever else the machine does hits all of them; ratios are taken within each
-round, and their median and quartiles are reported. All run on one core: its time, other processes not counted.
+round, and their median and quartiles are reported. All run on one core: its time, other processes not counted. On a GPU it is
+the time of the clock.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -24,7 +28,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
+import torch as th
 from matplotlib import rc_context
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import trange
 
 from battery_env import ExtendedKalmanFilter, OnnxPolicy, PolicyEstimator
@@ -32,10 +40,18 @@ from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, step
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.records import Stream
 from benchmarks.study import Study, command_line, markdown, positive
-from sb3_lac import LAC
+from sb3_lac import LAC, GymnasiumVecEnv, PublishedLAC
 
+SECTIONS = ("updates", "model", "environments", "filters", "gpu")
+
+_ENV = "BatteryQmax-v0"
 _POLICY_ENV = "BatteryVoltageJoint-v0"
-SECTIONS = ("model", "environments", "filters")
+_TRANSITIONS = 1024
+# hidden layers, updates in a call of train(), calls in a turn
+_UPDATES = (([64, 64], 1, 50), ([64, 64], 50, 1), ([256, 256], 1, 10))
+# hidden layers, batch size, updates in a call on the GPU and on a core, where large networks take seconds for each
+_ON_GPU = (([64, 64], 256, 50, 50), ([256, 256, 256], 256, 50, 10), ([1024, 1024, 1024], 4096, 10, 1))
+_GPU = "cuda" if th.cuda.is_available() else ""
 # of one turn
 _SIMULATED_STEPS = 1500
 _SIMULATIONS = 20
@@ -59,6 +75,96 @@ def race(contestants: dict[str, Callable[[], int]], rounds: int, clock: Callable
             speed[name] = done / (clock() - start)
         speeds.append(speed)
     return pd.DataFrame(speeds)[list(contestants)]
+
+
+def updates_of(
+    algorithm: Callable[..., OffPolicyAlgorithm],
+    net_arch: list[int],
+    batch_size: int,
+    per_call: int,
+    calls: int,
+    **kwargs: Any,
+) -> Callable[[], int]:
+    """Turns of calls of ``train()``, of a model that has made its first updates."""
+    model = algorithm(
+        "MlpPolicy",
+        GymnasiumVecEnv(gym.make_vec(_ENV, num_envs=64, autoreset_mode="SameStep")),
+        learning_starts=_TRANSITIONS,
+        buffer_size=100 * _TRANSITIONS,
+        batch_size=batch_size,
+        policy_kwargs={"net_arch": net_arch},
+        seed=0,
+        **kwargs,
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    model.learn(_TRANSITIONS)
+
+    def turn() -> int:
+        for _ in range(calls):
+            model.train(gradient_steps=per_call, batch_size=batch_size)
+        return calls * per_call
+
+    # what is compiled is compiled, and has been replayed
+    for _ in range(3):
+        turn()
+    return turn
+
+
+def measure_updates(rounds: int) -> tuple[pd.DataFrame, str]:
+    """Updates a second on one core: small and large networks, one update in a call of ``train()`` and many."""
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+    from sbx import SAC as SBX  # heavy, and needed here only
+
+    th.set_num_threads(1)
+    tables, rows = [], []
+    for net_arch, per_call, calls in _UPDATES:
+        ready = partial(updates_of, net_arch=net_arch, batch_size=256, per_call=per_call, calls=calls)
+        contestants = {
+            "SAC": ready(SAC, device="cpu"),
+            "LAC": ready(LAC, device="cpu"),
+            "PublishedLAC": ready(PublishedLAC, device="cpu"),
+            "compiled LAC": ready(LAC, device="cpu", compile_update=True),
+            "SBX's SAC": ready(SBX),
+        }
+        speeds = race(contestants, rounds, time.process_time)
+        row = {"networks": "-".join(map(str, net_arch)), "updates in a call": per_call}
+        tables.append(speeds.assign(**row))
+        rows.append(
+            {
+                **row,
+                **{name: spread(values, 0) for name, values in speeds.items()},
+                "LAC / SAC": spread(speeds["LAC"] / speeds["SAC"], 2),
+                "compiled LAC / SBX's SAC": spread(speeds["compiled LAC"] / speeds["SBX's SAC"], 2),
+            }
+        )
+    return pd.concat(tables), markdown(rows)
+
+
+def measure_gpu(rounds: int) -> tuple[pd.DataFrame, str]:
+    """Updates a second on a GPU, compiled and not, beside those of SAC there and of compiled LAC on one core."""
+    th.set_num_threads(1)
+    tables, rows = [], []
+    for net_arch, batch_size, per_call, on_core in _ON_GPU:
+        ready = partial(updates_of, net_arch=net_arch, batch_size=batch_size, calls=1)
+        contestants = {
+            "SAC": ready(SAC, per_call=per_call, device=_GPU),
+            "LAC": ready(LAC, per_call=per_call, device=_GPU),
+            "compiled LAC": ready(LAC, per_call=per_call, device=_GPU, compile_update=True),
+            "compiled LAC, one core": ready(LAC, per_call=on_core, device="cpu", compile_update=True),
+        }
+        speeds = race(contestants, rounds, time.perf_counter)
+        row = {"networks": "-".join(map(str, net_arch)), "batch": batch_size, "updates in a call": per_call}
+        tables.append(speeds.assign(**row))
+        rows.append(
+            {
+                **row,
+                **{name: spread(values, 0 if values.median() > 10.0 else 2) for name, values in speeds.items()},
+                "LAC / SAC": spread(speeds["LAC"] / speeds["SAC"], 2),
+                "compiled / not": spread(speeds["compiled LAC"] / speeds["LAC"], 2),
+                "compiled, GPU / one core": spread(speeds["compiled LAC"] / speeds["compiled LAC, one core"], 1),
+            }
+        )
+    return pd.concat(tables).assign(GPU=th.cuda.get_device_name()), markdown(rows)
 
 
 def model_contestants(cells: int) -> dict[str, Callable[[], int]]:
@@ -227,24 +333,31 @@ def report_steps(speeds: pd.DataFrame) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = command_line("throughput", __doc__, jobs=None)
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), help="what to measure, all by default")
-    parser.add_argument("--rounds", type=positive, default=40, help="turns of each contestant")
+    parser = command_line("speed", __doc__, jobs=None)
     parser.add_argument(
-        "--cells", type=positive, default=1024, help="cells of a batch of the model and of a vector environment"
+        "--only", nargs="+", choices=SECTIONS, default=list(SECTIONS if _GPU else SECTIONS[:-1]), help="what to measure"
     )
+    parser.add_argument("--rounds", type=positive, default=20, help="turns of each contestant")
+    parser.add_argument("--cells", type=positive, default=1024, help="cells of a batch of the model and of an environment")
     study = Study(parser, arguments)
     chosen = study.chosen
+    if "gpu" in chosen.only and not _GPU:
+        parser.error("gpu needs an NVIDIA GPU that torch can use: torch.cuda.is_available() is False")
+    measures = {"updates": measure_updates, "gpu": measure_gpu}
     with TemporaryDirectory() as folder:
-        sections = {
+        raced = {
             "model": (partial(model_contestants, chosen.cells), report_steps),
             "environments": (partial(environment_contestants, chosen.cells), report_steps),
             "filters": (partial(filter_contestants, Path(folder)), report_filters),
         }
         for section in chosen.only:
-            contestants, report = sections[section]
-            speeds = race(contestants(), chosen.rounds, time.process_time)
-            study.write({section: speeds}, {}, report(speeds), section)
+            if section in measures:
+                speeds, text = measures[section](chosen.rounds)
+            else:
+                contestants, report = raced[section]
+                speeds = race(contestants(), chosen.rounds, time.process_time)
+                text = report(speeds)
+            study.write({section: speeds}, {}, text, section)
 
 
 if __name__ == "__main__":
