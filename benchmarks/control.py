@@ -7,17 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from battery_env.plotting import save_figure
 from benchmarks.study import EVALUATION_SEED
 from sb3_lac import certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.costs import CostAlgorithm
@@ -140,24 +137,9 @@ def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
     rows = []
     for condition, arguments in conditions(env_id).items():
         text = ", ".join(f"{name}={value}" for name, value in arguments.items())
-        described = {"environment": env_id, "disturbance": condition, "arguments": text}
+        described = {"disturbance": condition, "arguments": text}
         rows.append(described | tried_with(policy, env_id, episodes, arguments))
     return pd.DataFrame(rows)
-
-
-def draw_shares(axes: Axes, results: pd.DataFrame, by: str, order: list[str]) -> None:
-    """Draw a map of the episodes that end at the goal, and in brackets of those that die, by disturbance."""
-    shares, deaths = (
-        results.pivot_table(index=by, columns="disturbance", values=column, sort=False).loc[order]
-        for column in ("at_goal", "died")
-    )
-    axes.imshow(shares, vmin=0.0, vmax=1.0, aspect="auto", cmap="cividis")
-    for i, j in np.ndindex(shares.shape):
-        share, death = shares.iloc[i, j], deaths.iloc[i, j]
-        text = f"{share:.0%}" + (f" ({death:.0%})" if death > 0 else "")
-        axes.text(j, i, text, ha="center", va="center", color="black" if share > 0.5 else "white", size=8)
-    axes.set_xticks(range(shares.shape[1]), [name.replace(" ", "\n") for name in shares.columns], fontsize="small")
-    axes.set_yticks(range(len(order)), order)
 
 
 class ScaledController:
@@ -183,30 +165,22 @@ class ScaledController:
         return self.factor * actions, state
 
 
-def factors(env_id: str) -> dict[str, float]:
-    """The loops of an environment."""
-    return LINEAR_FACTORS if env_id == "LinearCost-v0" else FACTORS
-
-
 def controllers(env_id: str) -> dict[str, PolicyPredictor]:
     """Controllers that settle, and controllers that do not."""
     reference = reference_controller(gym.make(env_id))
-    return {name: ScaledController(reference, factor) for name, factor in factors(env_id).items()}
+    factors = LINEAR_FACTORS if env_id == "LinearCost-v0" else FACTORS
+    return {name: ScaledController(reference, factor) for name, factor in factors.items()}
 
 
-def judge(policy: PolicyPredictor, env_id: str, episodes: int, figures: Path | None = None) -> list[dict[str, Any]]:
+def judge(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
     """Fit, evaluate and certify one policy; for LAC, the critic beside the fitted function."""
     env = make_vec_env(env_id, n_envs=CERTIFICATE_ENVS)
     fitted = fit_lyapunov(policy, env, episodes, seed=_FIT_SEED, progress_bar=False)
     certification = certify(policy, env, fitted, episodes, seed=_CERTIFICATION_SEED)
-    if figures is not None:
-        save_figure(certification.plot(), figures.with_name(f"{figures.name}_statements.png"))
     functions = {"fitted": fitted} | ({"critic": CriticLyapunov(policy)} if isinstance(policy, CostAlgorithm) else {})
     rows = []
     for function, lyapunov in functions.items():
         report = evaluate_lyapunov(policy, env, episodes, seed=_JUDGE_SEED, lyapunov=lyapunov)
-        if figures is not None:
-            save_figure(report.plot_drift(), figures.with_name(f"{figures.name}_{function}_drift.png"))
         row: dict[str, Any] = {"function": function, "holds": report.holds}
         settled_below = SETTLED_SHARE * report.metrics["start_cost"].value
         row["settles"] = report.holds and report.metrics["cost_bound"].high < settled_below
@@ -218,4 +192,4 @@ def judge(policy: PolicyPredictor, env_id: str, episodes: int, figures: Path | N
             row |= {"settles_within": certification.ultimate_bound, "window_steps": certification.window_steps}
         rows.append(row)
     env.close()
-    return rows
+    return pd.DataFrame(rows)

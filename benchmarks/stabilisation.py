@@ -6,13 +6,16 @@ costs, whether it ends at the goal, what disturbances that it was not trained fo
 
   python -m benchmarks.stabilisation --timesteps 16000 --seeds 0 1 2
   python -m benchmarks.stabilisation --algos lac published_lac sac td3 tqc metric_sac --compile
-  python -m benchmarks.stabilisation --algos    # the reference controllers alone
+  python -m benchmarks.stabilisation --algos
+  python -m benchmarks.stabilisation --algos --weak-controllers
 
 Policies are trained without disturbances, with the hyperparameters of ``zoo_configs``, and judged by their mean action. All of
 them have the same starts and disturbances. ``sac_common``, ``td3_common`` and ``tqc_common`` have the one setting of LAC for
 all problems in place of their own for each; ``published_lac`` has it too, and ``published_lac_paper`` that of its authors.
 ``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is LAC's from what is the metric's. What is
-done is not done again when the command is repeated, so that seeds can be added.
+done is not done again when the command is repeated, so that seeds can be added. Without algorithms only controllers are judged,
+which takes minutes; with ``--weak-controllers`` also those with too little gain or the wrong sign, of which a certificate must
+not say that they settle.
 ``tensorboard --logdir results/stabilisation/models`` overlays the curves of all trainings.
 """
 
@@ -39,7 +42,19 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import COLOUR_OF, COLOURS, new_figure
-from benchmarks.control import DISTURBANCES, SETTLED_SHARE, SHARES, conditions, draw_shares, judge, roll_out, shares_of, tried
+from benchmarks.control import (
+    DISTURBANCES,
+    FACTORS,
+    LINEAR_FACTORS,
+    SETTLED_SHARE,
+    SHARES,
+    conditions,
+    controllers,
+    judge,
+    roll_out,
+    shares_of,
+    tried,
+)
 from benchmarks.study import (
     Cell,
     Study,
@@ -57,7 +72,7 @@ from benchmarks.study import (
     write_text,
 )
 from benchmarks.training import Recipe, record_file, train_or_load, training_minutes
-from sb3_lac.envs import CostEnv, reference_controller
+from sb3_lac.envs import CostEnv
 from sb3_lac.stability.plots import format_log_axis
 
 
@@ -135,7 +150,8 @@ CONTENDERS = {
     "metric_sac": Contender(_METRIC_SAC, "SAC, LAC's metric", COLOURS[4], "v", compiles=True),
 }
 #: How they are drawn: colour and marker.
-STYLES = {each.label: (each.colour, each.marker) for each in CONTENDERS.values()} | {REFERENCE: ("black", "|")}
+STYLES = {each.label: (each.colour, each.marker) for each in CONTENDERS.values()}
+STYLES |= dict(zip({**FACTORS, **LINEAR_FACTORS}, (("black", marker) for marker in "|123x"), strict=True))
 # learning curves, whose episodes have other starts than those of all other judgements
 _POINTS, _CURVE_EPISODES, _CURVE_SEED = 12, 30, 40_000
 
@@ -189,17 +205,16 @@ def part(
     models: Path,
     compiled: bool,
 ) -> Tables:
-    """Train a policy, or take the reference controller, and judge it."""
+    """Train a policy, or take a controller, and judge it."""
     predictor: PolicyPredictor
-    if policy == REFERENCE:
-        predictor, updates, minutes = reference_controller(gym.make(env_id)), None, None
+    if seed is None:
+        predictor, updates, minutes = controllers(env_id)[policy], None, None
         learning = pd.DataFrame([{"timesteps": np.nan, "updates": np.nan, **_cost_of(predictor, env_id)}])
     else:
-        assert seed is not None
         chosen, folder = CONTENDERS[policy], models / f"{env_id}_{policy}_seed{seed}"
         made_from = chosen.recipe(env_id, seed, timesteps)
         predictor, updates, minutes, learning = chosen.trained(made_from, recipe, folder, compiled)
-    label = policy if policy == REFERENCE else CONTENDERS[policy].label
+    label = policy if seed is None else CONTENDERS[policy].label
     of_policy = {"environment": env_id, "policy": label, "seed": seed}
     described: dict[str, Any] = {
         **of_policy,
@@ -208,11 +223,9 @@ def part(
         "training_minutes": minutes,
         "recipe": recipe,
     }
-    outcomes = tried(predictor, env_id, episodes).drop(columns="environment")
-    certificates = pd.DataFrame(judge(predictor, env_id, certificate_episodes))
     return {
-        "stabilisation": _beside(described, outcomes),
-        "certificates": _beside(described, certificates),
+        "stabilisation": _beside(described, tried(predictor, env_id, episodes)),
+        "certificates": _beside(described, judge(predictor, env_id, certificate_episodes)),
         "learning": _beside(of_policy, learning),
     }
 
@@ -222,11 +235,17 @@ def _beside(described: dict[str, Any], rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def parts_of(
-    chosen: argparse.Namespace, contender: Callable[[str, str], Contender], timesteps: Callable[[str], int | None]
+    chosen: argparse.Namespace,
+    contender: Callable[[str, str], Contender],
+    timesteps: Callable[[str], int | None],
+    untrained: Callable[[str], Iterable[str]] = lambda env_id: [REFERENCE],
 ) -> list[dict[str, Any]]:
-    """The reference in each environment, then seed by seed each policy, so that an interrupted study has whole seeds."""
-    untrained = {"seed": None, "timesteps": None, "recipe": None}
-    parts: list[dict[str, Any]] = [{"policy": REFERENCE, "env_id": env_id, **untrained} for env_id in chosen.envs]
+    """The controllers of each environment, then seed by seed each policy, so that an interrupted study has whole seeds."""
+    parts: list[dict[str, Any]] = [
+        {"policy": name, "env_id": env_id, "seed": None, "timesteps": None, "recipe": None}
+        for env_id in chosen.envs
+        for name in untrained(env_id)
+    ]
     for seed, env_id, policy in product(chosen.seeds, chosen.envs, chosen.algos):
         recipe = contender(policy, env_id).recipe(env_id, seed, timesteps(env_id))
         made_from = {"seed": seed, "timesteps": recipe.timesteps, "recipe": recipe.digest}
@@ -248,7 +267,7 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
     """What policies cost and where they end, without disturbances."""
 
     def of_trained(said: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
-        return lambda group: "" if group["policy"].iloc[0] == REFERENCE else said(group)
+        return lambda group: "" if group["seed"].isna().all() else said(group)
 
     cells: dict[str, Cell] = {
         "seeds": of_trained(lambda group: str(len(group))),
@@ -374,7 +393,7 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
         of_env = learning[learning["environment"] == env_id]
         for name, (colour, marker) in STYLES.items():
             of_policy = of_env[of_env["policy"] == name]
-            if name == REFERENCE:
+            if len(of_policy) and of_policy["seed"].isna().all():
                 axes.axhline(float(of_policy["cost"].iloc[0]), color=colour, ls="--", lw=1.0, label=name)
             elif not of_policy.empty:
                 costs = of_policy.pivot_table(index="seed", columns="timesteps", values="cost").dropna(axis="columns")
@@ -399,7 +418,18 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
     figure, panels = new_panels(len(envs), 2, (5.6, 2.1), margin=(0.0, 0.5))
     for axes, env_id in zip(panels, envs, strict=True):
         of_env = results[results["environment"] == env_id]
-        draw_shares(axes, of_env, "policy", [name for name in STYLES if name in set(of_env["policy"])])
+        names = [name for name in STYLES if name in set(of_env["policy"])]
+        shares, deaths = (
+            of_env.pivot_table(index="policy", columns="disturbance", values=column, sort=False).loc[names]
+            for column in ("at_goal", "died")
+        )
+        axes.imshow(shares, vmin=0.0, vmax=1.0, aspect="auto", cmap="cividis")
+        for i, j in np.ndindex(shares.shape):
+            share, death = shares.iloc[i, j], deaths.iloc[i, j]
+            text = f"{share:.0%}" + (f" ({death:.0%})" if death > 0 else "")
+            axes.text(j, i, text, ha="center", va="center", color="black" if share > 0.5 else "white", size=8)
+        axes.set_xticks(range(shares.shape[1]), [name.replace(" ", "\n") for name in shares.columns], fontsize="small")
+        axes.set_yticks(range(len(names)), names)
         axes.set_title(env_id)
     figure.suptitle("episodes that end at the goal (that die)")
     return figure
@@ -408,7 +438,8 @@ def plot_disturbances(results: pd.DataFrame) -> Figure:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("stabilisation", __doc__)
-    parser.add_argument("--algos", nargs="*", default=["lac", "sac", "td3"], choices=list(CONTENDERS))
+    parser.add_argument("--algos", nargs="*", default=["lac", "sac", "td3"], choices=list(CONTENDERS), help="none: no training")
+    parser.add_argument("--weak-controllers", action="store_true", help="judge controllers, too, that are not to settle")
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
     parser.add_argument(
@@ -420,8 +451,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     study = Study(parser, arguments)
     chosen = study.chosen
     judged = {"episodes": chosen.episodes, "certificate_episodes": chosen.certificate_episodes}
+
+    def untrained(env_id: str) -> Iterable[str]:
+        return controllers(env_id) if chosen.weak_controllers else [REFERENCE]
+
     try:
-        parts = parts_of(chosen, lambda policy, env_id: CONTENDERS[policy], lambda env_id: chosen.timesteps)
+        parts = parts_of(chosen, lambda policy, env_id: CONTENDERS[policy], lambda env_id: chosen.timesteps, untrained)
     except ValueError as error:
         parser.error(str(error))
     study.configuration["disturbances"] = {env_id: conditions(env_id) for env_id in chosen.envs}

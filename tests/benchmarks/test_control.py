@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 pytest.importorskip("rl_zoo3")
 
-from benchmarks import certificate, control, linear_cost, stabilisation
+from benchmarks import control, linear_cost, stabilisation
 from docs.environment_pages import DOCS, environment_page
 from sb3_lac import LAC
 from sb3_lac.envs import LinearCostEnv
@@ -89,8 +89,8 @@ def test_only_some_loops_end_at_the_goal(env_id):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_pages_say_what_the_published_table_says(env_id):
-    table = pd.read_csv(DOCS / "results/references/references.csv")
-    row = table[(table["environment"] == env_id) & (table["disturbance"] == "none")].iloc[0]
+    table = pd.read_csv(DOCS / "results/stabilisation/stabilisation.csv").set_index(["environment", "policy", "disturbance"])
+    row = table.loc[env_id, "reference", "none"]
     section = re.search(r"## Reference Controller\n(.*?)\n## ", environment_page(env_id), flags=re.DOTALL)[1]
     text = " ".join(section.split())
     assert float(re.search(r"costs? ([\d.]+) per step", text)[1]) == pytest.approx(row["cost"], rel=0.03)
@@ -101,42 +101,9 @@ def test_pages_say_what_the_published_table_says(env_id):
 
 @pytest.fixture
 def quick(monkeypatch, train_nothing):
-    """One controller instead of all, few passes over the data, models that are not trained; returns what was asked for."""
+    """Few passes over the data, models that are not trained; returns what was asked for."""
     monkeypatch.setattr(fitting, "N_ITERATIONS", 3)
-    reference = {"reference": control.controllers("LinearCost-v0")["reference"]}
-    monkeypatch.setattr(certificate, "controllers", lambda env_id: reference)
-    return [*map(train_nothing, (certificate, stabilisation))]
-
-
-def test_certificates_of_controllers_and_models_are_written(tmp_path, quick, capsys):
-    command = ["--envs", "LinearCost-v0", "--algos", "lac", "--seeds", "3", "--episodes", "25", "--out", str(tmp_path)]
-    certificate.main([*command, "--fractions", "0.1"])
-    table = pd.read_csv(tmp_path / "certificates.csv")
-    assert table["policy"].tolist() == ["reference"] + 2 * ["LAC, 10 % of the updates"]
-    assert table["function"].tolist() == ["fitted", "fitted", "critic"]
-    # Statements are made once for each policy
-    assert table["survives_at_least"].notna().tolist() == [True, True, False]
-    assert (table["cost_bound_low"] <= table["cost_bound"]).all() and table["start_cost"].gt(0).all()
-    assert len(list(tmp_path.glob("*_statements.png"))) == 2 and len(list(tmp_path.glob("*_drift.png"))) == 3
-    text = (tmp_path / "certificates.md").read_text(encoding="utf-8")
-    assert text in capsys.readouterr().out and "| LAC, 10 % of the updates (critic)" in text and "nan" not in text
-    # no longer than zoo_configs has, nor than what is asked for; a tenth of the updates follows the first thousand steps
-    certificate.main([*command, "--timesteps", "5000"])
-    assert [call[-1] for call in quick[0]] == [6900, 5000]
-
-
-def test_several_seeds_of_a_certificate_are_shown_from_least_to_most():
-    rows = [
-        {"env": "LinearCost-v0", "policy": "LAC", "seed": seed, "function": "fitted", "holds": seed > 0, "settles": False}
-        | {"start_cost": 2.0, "cost_bound": bound, "cost_bound_low": bound / 2, "cost_bound_high": 2 * bound}
-        | {"cost_bound_alpha3": alpha3, "largest_feasible_alpha3": 0.5, "survives_at_least": 0.9}
-        | {"stays_within_at_least": np.nan, "decreases_at_least": 0.1 * seed}
-        for seed, bound, alpha3 in ((0, 3.0, np.nan), (1, 1.0, 0.25), (2, 1.5, 0.75))
-    ]
-    of_seeds = certificate.report(pd.DataFrame(rows)).splitlines()[-1]
-    cells = [cell.strip() for cell in of_seeds.strip("|").split("|")]
-    assert cells[:4] == ["LAC", "2 of 3", "0 of 3", "2"]
-    assert cells[4:] == ["1.5 (1 to 3)", "0.5 (0.25 to 0.75), of 2", "0.5", "0.9", "-", "0.1 (0 to 0.2)"]
+    return train_nothing(stabilisation)
 
 
 def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys):
@@ -145,11 +112,14 @@ def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys
     stabilisation.main([*command, "--seeds", "0"])
     stabilisation.main([*command, "--seeds", "0", "1"])
     # As long as was asked for, and nothing twice
-    assert quick[1] == [("lac", "LinearCost-v0", 0, 20_000), ("lac", "LinearCost-v0", 1, 20_000)]
+    assert quick == [("lac", "LinearCost-v0", 0, 20_000), ("lac", "LinearCost-v0", 1, 20_000)]
     names = ("stabilisation", "certificates", "learning")
     results, certificates, learning = (pd.read_csv(tmp_path / f"{name}.csv") for name in names)
     assert results["policy"].tolist() == 12 * ["LAC"] + 6 * ["reference"]
     assert certificates["function"].tolist() == ["fitted", "critic", "fitted", "critic", "fitted"]
+    # Statements are made once for each policy
+    assert certificates["survives_at_least"].notna().tolist() == [True, False, True, False, True]
+    assert (certificates["cost_bound_low"] <= certificates["cost_bound"]).all() and certificates["start_cost"].gt(0).all()
     # without what the learning curve took
     assert results["training_minutes"].iloc[:12].between(1.4, 1.5, inclusive="left").all()
     assert learning["policy"].tolist() == ["LAC", "LAC", "reference"] and learning["cost"].notna().all()
@@ -170,6 +140,18 @@ def test_without_a_number_of_steps_it_is_that_of_the_zoo():
         chosen, lambda policy, env_id: stabilisation.CONTENDERS[policy], lambda env_id: None
     )
     assert reference["timesteps"] is None and [each["timesteps"] for each in parts] == [60_000, 60_000]
+
+
+def test_controllers_are_judged_without_training_and_weak_ones_leave_the_goal(tmp_path, quick):
+    command = ["--envs", "LinearCost-v0", "--algos", "--weak-controllers", "--episodes", "3", "--jobs", "1"]
+    stabilisation.main([*command, "--certificate-episodes", "25", "--out", str(tmp_path)])
+    results, certificates = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("stabilisation", "certificates"))
+    assert not quick and results["seed"].isna().all()
+    assert certificates["policy"].tolist() == ["reference", "weak", "wrong sign", "hardly unstable"]
+    at_goal = results[results["disturbance"] == "none"].set_index("policy")["at_goal"]
+    assert at_goal["reference"] == 1 and at_goal["wrong sign"] == 0
+    assert "| hardly unstable" in (tmp_path / "stabilisation.md").read_text(encoding="utf-8")
+    assert all((tmp_path / name).stat().st_size > 1000 for name in ("costs.png", "disturbances.png", "learning.png"))
 
 
 def test_settings_that_change_during_a_study_are_refused(tmp_path):

@@ -9,14 +9,12 @@ import pytest
 
 from benchmarks import (
     calibrators,
-    certificate,
     direct_mapping,
     linear_cost,
     published,
     speed,
     stabilisation,
 )
-from benchmarks.study import markdown
 
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"
 
@@ -54,8 +52,3 @@ REPORTS = {
 def test_what_is_shown_is_what_the_report_says_of_the_published_tables(name):
     tables = {path.stem: pd.read_csv(path) for path in (PUBLISHED / name).parent.glob("*.csv")}
     assert REPORTS[name](tables) == (PUBLISHED / f"{name}.md").read_text(encoding="utf-8"), "run the study with --redraw"
-
-
-def test_certificates_begin_with_what_holds_exactly():
-    shown = (PUBLISHED / "certificates" / "certificates.md").read_text(encoding="utf-8")
-    assert markdown(certificate.feasible_alpha3()) in shown
