@@ -22,7 +22,6 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import pandas as pd
 import torch as th
-from matplotlib.figure import Figure
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
@@ -33,7 +32,6 @@ from battery_env.estimators.closed_form import ClosedForm
 from battery_env.estimators.estimator import Estimator
 from battery_env.evaluation import evaluate
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.plotting import LABELS, coloured, new_figure
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.tasks.full_state.layout import LITERAL, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
@@ -285,29 +283,6 @@ worst: of any seed; spread: standard deviation within a discharge.
     return text + markdown(table)
 
 
-def plot_errors(results: pd.DataFrame) -> Figure:
-    """The error of every test discharge."""
-    learned = results[results["seed"].notna()]
-    methods = list(dict.fromkeys(learned["method"]))
-    figure = new_figure(10.4, 5.8)
-    panels = figure.subplots(len(ENV_IDS), len(DIVISIONS), sharex="row", sharey="row", squeeze=False)
-    for row, parameter in zip(panels, get_args(Parameter), strict=True):
-        for axes, division in zip(row, DIVISIONS, strict=True):
-            values = getattr(divided(parameter, division)[0], parameter)
-            axes.axvspan(values.min(), values.max(), color="0.93", zorder=0, label="values trained on")
-            of_panel = learned[(learned["parameter"] == parameter) & (learned["division"] == division)]
-            for colour, method in coloured(methods):
-                group = of_panel[of_panel["method"] == method]
-                axes.plot(group["true"], group["mape_percent"], "o", ms=2.5, mew=0, alpha=0.5, color=colour, label=method)
-            axes.set(yscale="log", title=f"{LABELS[parameter].split(' (')[0]}: {_TESTED[division]}")
-            axes.set_xlabel(f"true {LABELS[parameter]}")
-            axes.grid(which="major", alpha=0.25)
-        row[0].set_ylabel("mean error of a discharge (%)")
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=9, markerscale=2.5)
-    return figure
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("direct_mapping", __doc__, jobs=1)
@@ -339,7 +314,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     groups = together.groupby(["parameter", "division"])
     results = pd.concat([groups.get_group(tuple(place.values())) for place in places], ignore_index=True)
     text = report(results, study.configuration)
-    study.write({"direct_mapping": results}, {"direct_mapping": plot_errors(results)}, text)
+    study.write({"direct_mapping": results}, {}, text)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from functools import partial
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, simulate
@@ -32,7 +31,6 @@ from battery_env.lab.life import Life, track_life
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, RandomPiecewise, RandomWalk, constant
-from battery_env.plotting import coloured, new_figure
 from battery_env.records import Record, drawn
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from benchmarks.study import Cell, Study, command_line, markdown, natural, positive, table_of
@@ -253,27 +251,6 @@ def life_table(lives: dict[str, Life], remaining: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-def plot(rows: pd.DataFrame) -> Figure:
-    """The mean error of each method over what was seen of the discharge, one colour a method and one panel a kind of load."""
-    figure = new_figure(6.4, 5.2)
-    loads, methods = list(rows["load"].unique()), list(dict.fromkeys(rows["method"]))
-    panels = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
-    error = rows.assign(error=rows["error_percent"].abs()).groupby(["load", "method", "share"], sort=False)["error"].mean()
-    for axes, load in zip(panels, loads, strict=False):
-        for colour, method in coloured(methods):
-            mean = error[load][method]
-            axes.plot(100.0 * mean.index, mean, marker="o", ms=3.5, lw=1.4, color=colour, label=method)
-        axes.set_title(load, fontsize=10)
-        axes.set(yscale="log", xticks=[25, 50, 75])
-        axes.grid(alpha=0.25)
-    for axes in panels[2:]:
-        axes.set_xlabel("seen of the discharge (%)")
-    for axes in panels[::2]:
-        axes.set_ylabel("mean error of the end (%)")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=9)
-    return figure
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("forecasts", __doc__, jobs=None)
@@ -306,10 +283,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for kind in LOADS:
             rows += simulated_rows(kind, seed, fit, chosen.simulated)
     forecasts, left = pd.DataFrame(rows), pd.DataFrame(remaining)
-    text, figures = markdown(end_of_discharge_table(forecasts)), {"forecasts": plot(forecasts)}
+    text = markdown(end_of_discharge_table(forecasts))
     if len(left):
         text += "\n" + markdown(life_table(lives, left))
-    study.write({"discharges": forecasts, "life": left}, figures, text, "summary")
+    study.write({"discharges": forecasts, "life": left}, {}, text, "summary")
 
 
 if __name__ == "__main__":

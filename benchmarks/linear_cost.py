@@ -19,12 +19,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from scipy.stats import bootstrap
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from battery_env.plotting import COLOUR_OF, new_figure
 from benchmarks.study import (
     EVALUATION_SEED,
     Cell,
@@ -138,18 +136,6 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
     return {"linear_cost": pd.DataFrame([row]), "values": values}
 
 
-def plot(values: pd.DataFrame) -> Figure:
-    """Learned against exact values of all seeds."""
-    figure = new_figure(4.6, 3.6)
-    axes = figure.subplots()
-    top = values[["exact", "learned"]].to_numpy().max()
-    axes.plot([0, top], [0, top], color=COLOUR_OF["true"], lw=1, label="equal")
-    axes.scatter(values["exact"], values["learned"], s=5, alpha=0.3, lw=0, color=COLOUR_OF["LAC"], label="LAC, all seeds")
-    axes.set(xlabel="exact cost to come", ylabel="learned L")
-    axes.legend(frameon=False)
-    return figure
-
-
 def report(table: pd.DataFrame) -> str:
     """Learned and exact values side by side, as Markdown."""
     cells: dict[str, Cell] = {
@@ -177,8 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = study.chosen
     parts = [{"seed": seed, "timesteps": chosen.timesteps, "episodes": chosen.episodes} for seed in chosen.seeds]
     tables = study.run(part, parts, models=study.out / "models")
-    table = tables["linear_cost"]
-    study.write(tables, {"linear_cost": plot(tables["values"])}, report(table))
+    study.write(tables, {}, report(tables["linear_cost"]))
 
 
 if __name__ == "__main__":

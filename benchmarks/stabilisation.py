@@ -13,9 +13,9 @@ Policies are trained without disturbances, with the hyperparameters of ``zoo_con
 them have the same starts and disturbances. ``sac_common``, ``td3_common`` and ``tqc_common`` have the one setting of LAC for
 all problems in place of their own for each; ``published_lac`` has it too, and ``published_lac_paper`` that of its authors.
 ``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is LAC's from what is the metric's. What is
-done is not done again when the command is repeated, so that seeds can be added. Without algorithms only controllers are judged,
-which takes minutes; with ``--weak-controllers`` also those with too little gain or the wrong sign, of which a certificate must
-not say that they settle.
+done is not done again when the command is repeated, so that seeds can be added. Without algorithms only controllers are
+judged, which takes minutes; with ``--weak-controllers`` also those with too little gain or the wrong sign, of which a
+certificate must not say that they settle.
 ``tensorboard --logdir results/stabilisation/models`` overlays the curves of all trainings.
 """
 
@@ -33,7 +33,6 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -41,7 +40,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
-from battery_env.plotting import COLOUR_OF, COLOURS, new_figure
+from battery_env.plotting import COLOUR_OF, COLOURS
 from benchmarks.control import (
     DISTURBANCES,
     FACTORS,
@@ -344,44 +343,6 @@ def report(tables: Tables) -> str:
     )
 
 
-def plot_costs(results: pd.DataFrame) -> Figure:
-    """
-    The cost of each policy and the share that ends at the goal: each seed, and the interquartile mean with its 95 % interval.
-    """
-    undisturbed = results[results["disturbance"] == "none"]
-    envs, names = list(undisturbed["environment"].unique()), [name for name in STYLES if name in set(undisturbed["policy"])]
-    figure = new_figure(8.6, 1.0 + 0.75 * len(envs))
-    costs, goals = figure.subplots(1, 2, sharey=True)
-    yardsticks = undisturbed[undisturbed["policy"] == REFERENCE].set_index("environment")["cost"]
-    for row, env_id in enumerate(envs):
-        for number, name in enumerate(names):
-            of_policy = undisturbed[(undisturbed["environment"] == env_id) & (undisturbed["policy"] == name)]
-            if of_policy.empty:
-                continue
-            colour, marker = STYLES[name]
-            height = row + 0.7 * ((number + 0.5) / len(names) - 0.5)
-            for axes, values in ((costs, of_policy["cost"] / yardsticks[env_id]), (goals, of_policy["at_goal"])):
-                middle, low, high = (float(value) for value in over_seeds(values))
-                axes.scatter(values, np.full(len(values), height), s=8, color=colour, alpha=0.35, lw=0)
-                axes.plot([low, high], [height, height], color=colour, lw=1.5)
-                axes.plot(middle, height, marker, color=colour, ms=6, label=name)
-    costs.set(xscale="log", xlabel="cost per step over that of the reference controller")
-    format_log_axis(costs.xaxis)
-    costs.set_yticks(range(len(envs)), envs)
-    costs.invert_yaxis()
-    goals.set(xlabel="share of episodes that end at the goal", xlim=(-0.03, 1.03))
-    _add_legend(figure, [costs], names)
-    return figure
-
-
-def _add_legend(figure: Figure, panels: Sequence[Axes], names: Iterable[str]) -> None:
-    """One entry for each name that any panel has, whichever that is."""
-    handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    shown = [name for name in names if name in handles]
-    labels, columns = [handles[name] for name in shown], min(len(shown), 5)
-    figure.legend(labels, shown, loc="outside lower center", ncols=columns, fontsize="small")
-
-
 def plot_learning(learning: pd.DataFrame) -> Figure:
     """
     Cost of the mean action while policies are trained, one panel per environment: the interquartile mean over seeds in a band
@@ -406,39 +367,18 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
         axes.set_ylabel("cost per step")
     for axes in panels[-3:]:
         axes.set_xlabel("environment steps")
-    _add_legend(figure, panels, STYLES)
-    return figure
-
-
-def plot_disturbances(results: pd.DataFrame) -> Figure:
-    """
-    One map per environment: the share of episodes at the goal, and in brackets of those that die, by policy and disturbance.
-    """
-    envs = list(results["environment"].unique())
-    figure, panels = new_panels(len(envs), 2, (5.6, 2.1), margin=(0.0, 0.5))
-    for axes, env_id in zip(panels, envs, strict=True):
-        of_env = results[results["environment"] == env_id]
-        names = [name for name in STYLES if name in set(of_env["policy"])]
-        shares, deaths = (
-            of_env.pivot_table(index="policy", columns="disturbance", values=column, sort=False).loc[names]
-            for column in ("at_goal", "died")
-        )
-        axes.imshow(shares, vmin=0.0, vmax=1.0, aspect="auto", cmap="cividis")
-        for i, j in np.ndindex(shares.shape):
-            share, death = shares.iloc[i, j], deaths.iloc[i, j]
-            text = f"{share:.0%}" + (f" ({death:.0%})" if death > 0 else "")
-            axes.text(j, i, text, ha="center", va="center", color="black" if share > 0.5 else "white", size=8)
-        axes.set_xticks(range(shares.shape[1]), [name.replace(" ", "\n") for name in shares.columns], fontsize="small")
-        axes.set_yticks(range(len(names)), names)
-        axes.set_title(env_id)
-    figure.suptitle("episodes that end at the goal (that die)")
+    # one entry for each name that any panel has, whichever that is
+    handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    shown = [name for name in STYLES if name in handles]
+    entries = [handles[name] for name in shown], shown
+    figure.legend(*entries, loc="outside lower center", ncols=min(len(shown), 5), fontsize="small")
     return figure
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("stabilisation", __doc__)
-    parser.add_argument("--algos", nargs="*", default=["lac", "sac", "td3"], choices=list(CONTENDERS), help="none: no training")
+    parser.add_argument("--algos", nargs="*", default=["lac", "sac", "td3"], choices=list(CONTENDERS), help="may be none")
     parser.add_argument("--weak-controllers", action="store_true", help="judge controllers, too, that are not to settle")
     parser.add_argument("--envs", nargs="+", default=list(DISTURBANCES), choices=list(DISTURBANCES))
     parser.add_argument("--seeds", nargs="+", type=natural, default=[0, 1, 2, 3, 4])
@@ -462,13 +402,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     study.configuration["disturbances"] = {env_id: conditions(env_id) for env_id in chosen.envs}
     made = study.run(part, [each | judged for each in parts], models=study.out / "models", compiled=chosen.compile)
     tables = in_order(made, [*DISTURBANCES, *STYLES])
-    results = tables["stabilisation"]
-    figures = {
-        "costs": plot_costs(results),
-        "disturbances": plot_disturbances(results),
-        "learning": plot_learning(tables["learning"]),
-    }
-    study.write(tables, figures, report(tables))
+    study.write(tables, {"learning": plot_learning(tables["learning"])}, report(tables))
 
 
 if __name__ == "__main__":

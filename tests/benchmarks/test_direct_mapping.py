@@ -112,4 +112,3 @@ def test_the_study_compares_all_on_each_division(tmp_path, monkeypatch, capsys):
     # by parameter: three divisions with two mappings and the closed form, one of them with a policy
     assert text in capsys.readouterr().out and text.count("\n| ") == 1 + 2 * (3 * 3 + 1)
     assert json.loads((tmp_path / "direct_mapping.json").read_text())["configuration"]["pairs"] == 64
-    assert (tmp_path / "direct_mapping.png").stat().st_size > 0
