@@ -6,7 +6,6 @@ costs, whether it ends at the goal, what disturbances that it was not trained fo
 
   python -m benchmarks.stabilisation --timesteps 16000 --seeds 0 1 2
   python -m benchmarks.stabilisation --algos lac published_lac sac td3 tqc metric_sac --compile
-  python -m benchmarks.stabilisation --algos
   python -m benchmarks.stabilisation --algos --weak-controllers
 
 Policies are trained without disturbances, with the hyperparameters of ``zoo_configs``, and judged by their mean action. All of
