@@ -4,7 +4,6 @@ import hashlib
 import subprocess
 import sys
 from importlib.resources import files
-from itertools import product
 
 import numpy as np
 import pytest
@@ -30,23 +29,20 @@ from battery_env.tasks.data import standard_dataset
 from tests.sweeps import sweep
 
 FOLDER = files("battery_env.policies.pretrained_policies")
-#: The one that learned along the path of the bundled cells, by its id and whether it is for recorded cells.
-ALONG_A_PATH = ("BatteryVoltageJoint-v0", True)
-IDS = {"BatteryVoltageJoint-v0": ("q_mobile", "r_o")}
+ENV_ID = "BatteryVoltageJoint-v0"
 
 
 @pytest.mark.parametrize("recorded", [False, True])
-@pytest.mark.parametrize("env_id", IDS)
-def test_the_card_is_that_of_the_file(env_id, recorded, aged_both):
-    content, card = FOLDER.joinpath(f"{file_stem(env_id, recorded)}.onnx").read_bytes(), pretrained_card(env_id, recorded)
+def test_the_card_is_that_of_the_file(recorded, aged_both):
+    content, card = FOLDER.joinpath(f"{file_stem(ENV_ID, recorded)}.onnx").read_bytes(), pretrained_card(ENV_ID, recorded)
     assert len(content) < 1_000_000
     assert hashlib.sha256(content).hexdigest() == card["sha256"]
-    policy, options = pretrained_policy(env_id, recorded)
-    assert policy.env_id == card["env_id"] == card["recipe"]["env_id"] == env_id
+    policy, options = pretrained_policy(ENV_ID, recorded)
+    assert policy.env_id == card["env_id"] == card["recipe"]["env_id"] == ENV_ID
     assert policy.description["algorithm"] == card["algorithm"] == "LAC"
     trained_with = card["recipe"]["hyperparameters"]["env_kwargs"]
     assert trained_with["cost"] == "state" and ("process_noise_V" in trained_with) == recorded
-    if (env_id, recorded) == ALONG_A_PATH:
+    if recorded:  # along the path of the bundled cells
         assert isinstance(options["path"], AgingPath) and trained_with["reading_s"] == list(options["reading_s"])
         assert card["command"].startswith("python -m benchmarks.aging_paths") and len(card["recipe"]["seed"]) == 5
         assert {row["cell"] for row in card["scores"]} == set(BUNDLED_CELLS)
@@ -54,20 +50,19 @@ def test_the_card_is_that_of_the_file(env_id, recorded, aged_both):
         assert options == card["options"] and options.items() <= trained_with.items()
         assert card["command"].startswith("python -m benchmarks.pretrained") and "seed" in card["recipe"]
         assert {row["mismatch"] for row in card["scores"]} == {0.0, 0.1, 0.2}
-    env = PolicyEstimator.environment(env_id, dataset=aged_both, **options)
+    env = PolicyEstimator.environment(ENV_ID, dataset=aged_both, **options)
     assert policy.observation_shape == env.observation_space.shape
 
 
-@pytest.mark.parametrize(("env_id", "recorded"), sorted({*product(IDS, (False, True))} - {ALONG_A_PATH}))
-def test_it_does_what_its_card_says(env_id, recorded):
+def test_it_does_what_its_card_says():
     """On a tenth of the discharges, with 5 mV of noise and constants that are off by 20 %."""
-    data = standard_dataset(IDS[env_id], "piecewise", "test", mismatch=0.2)[:10]
-    estimator = PolicyEstimator.pretrained(env_id, recorded=recorded)
+    estimator = PolicyEstimator.pretrained()
+    data = standard_dataset(estimator.parameters, "piecewise", "test", mismatch=0.2)[:10]
     scores = evaluate(estimator, data, SensorErrors(noise_V=0.005), seed=1)
     for name in estimator.parameters:
         (row,) = (
             row
-            for row in pretrained_card(env_id, recorded)["scores"]
+            for row in pretrained_card(ENV_ID)["scores"]
             if (row["mismatch"], row["sensor"], row["parameter"]) == (0.2, "5 mV noise", name)
         )
         assert scores[f"{name}_second_half_mape_percent"].max() <= row["worst_percent"] + 1e-3
@@ -105,7 +100,7 @@ class TestWhatIsNotThere:
 
     @pytest.mark.parametrize("load_A", sweep(2.0, 1.0, 4.0))
     def test_pulses_whose_noise_is_not_noise(self, load_A):
-        _, options = pretrained_policy(*ALONG_A_PATH)
+        _, options = pretrained_policy(ENV_ID, recorded=True)
         pulses = Load(np.arange(3000) * 10.0, np.tile([load_A, 0.0], 1500), "current")
         for cell in TrajectoryDataset.along(options["path"], 4, [pulses], seed=7):
             found = calibrate(Discharge(cell.time_s, cell.voltage_V, cell.current_A, starts_at_rest=True), method="policy")
@@ -145,16 +140,15 @@ class TestDamage:
         return tmp_path
 
     @pytest.mark.parametrize("recorded", [False, True])
-    @pytest.mark.parametrize("env_id", IDS)
     @pytest.mark.parametrize("suffix", [".onnx", ".json"])
-    def test_a_flipped_bit_is_refused_by_every_door(self, suffix, env_id, recorded, copies):
-        policy = copies / f"{file_stem(env_id, recorded)}.onnx"
+    def test_a_flipped_bit_is_refused_by_every_door(self, suffix, recorded, copies):
+        policy = copies / f"{file_stem(ENV_ID, recorded)}.onnx"
         file, rng = policy.with_suffix(suffix), np.random.default_rng(0)
         whole, sha256 = file.read_bytes(), OnnxPolicy(policy).sha256
         doors = [
-            lambda: pretrained_policy(env_id, recorded),
-            lambda: PolicyEstimator.pretrained(env_id, recorded=recorded),
-            lambda: pretrained_card(env_id, recorded) if suffix == ".json" else OnnxPolicy(policy),
+            lambda: pretrained_policy(ENV_ID, recorded),
+            lambda: PolicyEstimator.pretrained(ENV_ID, recorded=recorded),
+            lambda: pretrained_card(ENV_ID, recorded) if suffix == ".json" else OnnxPolicy(policy),
         ]
         for place in (*rng.integers(len(whole), size=40), 0, len(whole) - 2):
             content = bytearray(whole)
