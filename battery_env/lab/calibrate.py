@@ -31,6 +31,7 @@ from battery_env.lab.readers.discharges import each_usable
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings
 from battery_env.loads import Load, LoadToCome, constant
+from battery_env.parameters import Q_MOBILE
 from battery_env.policies.estimator import PolicyEstimator
 from battery_env.records import STEADY_S, ExpectedCurrent, Samples, drawn, expected_current, history_of, mean_current_A
 from battery_env.records.discharge import Discharge
@@ -45,6 +46,8 @@ _MORE_SHARE = 0.2
 # The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
 # 0.1 %. What is farther off than this is another cell, load or chamber than these.
 _WARMTH_LIMIT_K = 20.0
+# So near to a bound, as a share of it, a search ended at it.
+_AT_BOUND = 1e-3
 # Nine of ten values of a normal distribution lie within so many standard deviations.
 _BAND_SD = 1.645
 
@@ -149,6 +152,7 @@ def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON
         charge = dict.fromkeys(charge, float("nan"))
     nominal_Ah = _nominal_Ah(model, settings, part.load.mean_A)
     eod_s, sd_eod_s = (shown.eod_time_s, float("nan")) if end is None else _middle(end.eod_time_s, estimate)
+    estimate = _of_its_size(estimate, settings, float(seen.loaded.charge_C))
     return Calibration(
         cycle=discharge.meta.get("cycle"),
         method=method,
@@ -245,6 +249,22 @@ def _estimate(
         estimate = replace(estimate, settled_q_mobile=False, reason=" ".join(filter(None, [estimate.reason, doubt])))
     model = RecordModel(cell_with(cell, estimate.constants), thermal, initial_soc=part.start.soc)
     return estimate, method, model, now
+
+
+def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Estimate:
+    """Without numbers where the search ended at its bound, as for a cell of far another size: a bound is no result."""
+    low_C, high_C = settings.q_mobile_bounds_C or Q_MOBILE.limits
+    if (
+        "q_mobile" not in settings.parameters
+        or low_C < (1.0 - _AT_BOUND) * estimate.q_mobile < (1.0 - _AT_BOUND) ** 2 * high_C
+    ):
+        return estimate
+    nothing = dict.fromkeys(("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"), float("nan"))
+    reason = estimate.reason
+    if drawn_C < Q_MOBILE.limits[0]:
+        least_mAh = Q_MOBILE.limits[0] / 3.6
+        reason = f"Cells below {least_mAh:.0f} mAh are not modelled, nor fitted: what was drawn is known, and no more."
+    return replace(estimate, **nothing, reason=reason)
 
 
 def _end(

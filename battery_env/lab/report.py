@@ -23,12 +23,12 @@ CALIBRATED_BY = {"kalman": "the Kalman filter", "policy": "the policy that comes
 _COLUMN_OF = {name: f"{name}_{parameter.unit}" for name, parameter in PARAMETERS.items()}
 
 
-def quantity(text: str = "", unit: str = "", digits: int = 0, scale: float = 1.0, unknown: str = "nan") -> Any:
+def quantity(text: str = "", unit: str = "", digits: int = 0, scale: float = 1.0) -> Any:
     """
     A column: its name for readers, of which a line has the last word, its unit, digits, and the scale to that unit, and what
     stands for NaN.
     """
-    return field(metadata={"text": text, "unit": unit, "digits": digits, "scale": scale, "unknown": unknown})
+    return field(metadata={"text": text, "unit": unit, "digits": digits, "scale": scale})
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,7 +64,7 @@ class Calibration:
     predicted_capacity_Ah: float = quantity("predicted capacity", "Ah", 3)
     sd_predicted_capacity_Ah: float = quantity("sd", "Ah", 3)
     nominal_Ah: float = quantity("nominal capacity", "Ah", 3)
-    state_of_health: float = quantity("state of health", "", 3, unknown="not known")
+    state_of_health: float = quantity("state of health", "", 3)
     sd_state_of_health: float = quantity("sd", "", 3)
     voltage_rmse_V: float = quantity("voltage RMSE", "mV", 1, 1e3)
     predicted_eod_time_s: float = quantity("{0.cut_off_V:g} V, predicted at", "s")
@@ -99,12 +99,12 @@ class Calibration:
         value, how = getattr(self, name), _HOW[name]
         if isinstance(value, bool):
             return "yes" if value else "no"
-        number = how["unknown"]
-        if not np.isnan(value):
-            digits = how["digits"] if digits is None else digits
-            if how["unit"] in ("Ah", "mohm"):  # of cells of any size, and a standard deviation as its value
-                digits = decimals(how["scale"] * getattr(self, name.removeprefix("sd_")), digits)
-            number = f"{how['scale'] * value:.{digits}f}"
+        if np.isnan(value):
+            return "not known"
+        digits = how["digits"] if digits is None else digits
+        if how["unit"] in ("Ah", "mohm"):  # of cells of any size, and a standard deviation as its value
+            digits = decimals(how["scale"] * getattr(self, name.removeprefix("sd_")), digits)
+        number = f"{how['scale'] * value:.{digits}f}"
         return f"{number} {how['unit']}" if how["unit"] and with_unit else number
 
     def sd_of(self, name: str) -> str:
