@@ -152,7 +152,7 @@ def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON
         charge = dict.fromkeys(charge, float("nan"))
     nominal_Ah = _nominal_Ah(model, settings, part.load.mean_A)
     eod_s, sd_eod_s = (shown.eod_time_s, float("nan")) if end is None else _middle(end.eod_time_s, estimate)
-    estimate = _of_its_size(estimate, settings, float(seen.loaded.charge_C))
+    estimate = _of_its_size(estimate, settings, float(part.loaded.charge_C))
     return Calibration(
         cycle=discharge.meta.get("cycle"),
         method=method,
