@@ -68,9 +68,7 @@ class PublishedLAC(CostAlgorithm):
     :param lambda_max: Upper limit of ``lambda`` [C]. If ``None``, it is 1, or ``lambda_init`` if that is larger.
     :param reward_bound: Largest reward that the environment can pay, see ``LAC``
     :param compile_update: Whether to compile each update to one graph, see ``LAC``
-    :param kwargs: ``n_steps`` (not of the paper, and not with a ``horizon``), ``check_observations``, ``use_sde``,
-        ``sde_sample_freq``, ``use_sde_at_warmup``, ``stats_window_size``, ``tensorboard_log``, ``policy_kwargs``, ``verbose``,
-        ``seed`` and ``device``, as those of ``LAC``
+    :param kwargs: The other arguments of ``LAC``; ``n_steps`` is not of the paper, and not with a ``horizon``
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
