@@ -17,12 +17,13 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from battery_env import Settings, calibrate, load_nasa_discharges, read_discharges
-from battery_env.lab import many
+from battery_env.lab.batch import calibrate_all
 from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.command_line import main
 from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.discharges import read_recordings
 from battery_env.lab.readers.testers import TESTERS
+from battery_env.lab.sources import find_sources
 
 RECORD = load_nasa_discharges("B0006")[99]
 TABLE = pd.DataFrame({"time": RECORD.time_s, "voltage": RECORD.voltage_V, "current": -RECORD.current_A})
@@ -184,7 +185,7 @@ def test_what_is_said_around_a_header_that_comes_again_is_left_out_with_it(aroun
         "\n".join([*above, header, *around[1], *lines[:100], *around[0], header, *around[1], *lines[100:]])
     )
     same(read(tmp_path / "cell.dta", "left out, as"))
-    assert [source.stem for source in many.find_sources([str(tmp_path)])] == ["cell"]
+    assert [source.stem for source in find_sources([str(tmp_path)])] == ["cell"]
 
 
 @pytest.mark.parametrize(
@@ -390,8 +391,8 @@ def test_the_cells_of_a_table_are_told_apart(order, tmp_path, capsys):
     assert [each.meta["cell"] for each in found] == ["B6", "B 5"]
     same(found[0])
     table.to_csv(tmp_path / "two.csv", index=False)
-    (source,) = many.find_sources([str(tmp_path / "two.csv")])
-    outcomes = list(many.calibrate_all([source], many.FileFormat(), Settings()))
+    (source,) = find_sources([str(tmp_path / "two.csv")])
+    outcomes = list(calibrate_all([source], FileFormat(), Settings()))
     assert [(each.cell, each.record) for each in outcomes] == [("B6", "two_B6"), ("B 5", "two_B_5")]
     assert {each.meta.get("cell") for each in read_discharges(TABLE.assign(cell_id="B6"))} == {None}
 
@@ -474,7 +475,7 @@ def test_a_folder_reads_numbered_text_and_names_what_it_left_out(tmp_path, capsy
     assert "a.res, b.h5, photo.png left out, by their names no records" in capsys.readouterr().err
     assert command([str(lab)]) == 0  # results are no records, and need not be named
     assert "results" not in capsys.readouterr().err
-    assert [source.stem for source in many.find_sources([str(lab / "cell.001")])] == ["cell"]
+    assert [source.stem for source in find_sources([str(lab / "cell.001")])] == ["cell"]
 
 
 @pytest.mark.parametrize(
