@@ -26,6 +26,7 @@ import pandas as pd
 import torch as th
 import yaml
 from filelock import FileLock, Timeout
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
@@ -155,6 +156,18 @@ class Rows:
         self.add(Rows(file).read(str))
 
 
+def save_checkpoint(model: BaseAlgorithm, file: Path, progress: Mapping[str, Any]) -> None:
+    """Write all that a training needs to go on as one file, which takes the place of the one before as a whole."""
+    saves = {"model.zip": model.save}
+    if isinstance(model, OffPolicyAlgorithm):
+        saves["replay_buffer.pkl"] = model.save_replay_buffer
+    with replacing(file) as part, ZipFile(part, "w") as archive:
+        for name, save in saves.items():
+            save(content := BytesIO())
+            archive.writestr(name, content.getvalue())
+        archive.writestr("progress.json", json.dumps(progress))
+
+
 class OutOfTimeError(Exception):
     """The time of a training is over before the training is, and what it has learned lies in its checkpoint."""
 
@@ -209,13 +222,7 @@ class Progress(BaseCallback):
         self._last = time.perf_counter()
 
     def _save(self) -> None:
-        assert isinstance(self.model, OffPolicyAlgorithm)
-        with replacing(self.file) as part, ZipFile(part, "w") as archive:
-            for name, save in (("model.zip", self.model.save), ("replay_buffer.pkl", self.model.save_replay_buffer)):
-                save(content := BytesIO())
-                archive.writestr(name, content.getvalue())
-            progress = {"curve": self.curve, "seconds": self.seconds, "resumed": self.resumed}
-            archive.writestr("progress.json", json.dumps(progress))
+        save_checkpoint(self.model, self.file, {"curve": self.curve, "seconds": self.seconds, "resumed": self.resumed})
         self._saved = time.perf_counter()
 
     def resume(self, run: Run, env: VecEnv) -> OffPolicyAlgorithm:

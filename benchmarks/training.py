@@ -11,8 +11,7 @@ import importlib
 import inspect
 import io
 import json
-import os
-import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -20,6 +19,7 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import gymnasium as gym
 import torch as th
@@ -29,10 +29,10 @@ from rl_zoo3 import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from battery_env.files import replacing
+from benchmarks.runs import save_checkpoint
 from benchmarks.study import digest_of, own_versions, recall, versions, write_json, write_text
 from sb3_lac.discounts import DEFAULT_DISCOUNT
 from sb3_lac.zoo import LACExperimentManager, find_config
@@ -272,10 +272,13 @@ class Training:
 
     def __init__(self, recipe: Recipe, folder: Path, **options: Any) -> None:
         self.recipe, self.folder = recipe, folder
-        self.checkpoint = CheckpointCallback(folder / f"checkpoint_{recipe.name}", recipe.evaluation_freq)
-        if self.checkpoint.resumed:
-            options["trained_agent"] = str(self.checkpoint.folder / "model.zip")
-        self.manager, self.model = set_up(recipe, folder / "zoo", **options)
+        self.checkpoint = CheckpointCallback(folder / f"checkpoint_{recipe.name}.zip", recipe.evaluation_freq)
+        with tempfile.TemporaryDirectory() as unpacked:
+            if self.checkpoint.resumed:
+                with ZipFile(self.checkpoint.file) as archive:
+                    archive.extractall(unpacked)
+                options["trained_agent"] = f"{unpacked}/model.zip"
+            self.manager, self.model = set_up(recipe, folder / "zoo", **options)
 
     def evaluation_env(self) -> VecEnv:
         """One more environment."""
@@ -305,7 +308,7 @@ class Training:
             "training_minutes": self.checkpoint.seconds / 60.0,
         }
         write_json(record, made_by)
-        shutil.rmtree(self.checkpoint.folder, ignore_errors=True)
+        self.checkpoint.file.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the environments of the model and its log, however the training went."""
@@ -370,24 +373,20 @@ def record_file(recipe: Recipe, folder: Path) -> Path:
 
 class CheckpointCallback(BaseCallback):
     """
-    Saves model and replay buffer in one folder that is replaced as a whole, so that a training can be resumed whenever it is
-    interrupted; and counts interruptions and time.
+    Keeps a checkpoint of a training, so that it can be resumed whenever it is interrupted; and counts interruptions and time.
 
-    :param folder: the folder, of an earlier part of the same training if it exists
+    :param file: the checkpoint, of an earlier part of the same training if it exists
     :param save_freq: calls between checkpoints; 0 for none
     """
 
-    def __init__(self, folder: Path, save_freq: int) -> None:
+    def __init__(self, file: Path, save_freq: int) -> None:
         super().__init__()
-        self.folder = folder
-        self.save_freq = save_freq
-        self.recover(folder)
-        #: How often the training was continued from a checkpoint.
-        self.resumed = 0
-        #: Wall time of the training, evaluations included.
-        self.seconds = 0.0
-        if save_freq and folder.exists():
-            before = json.loads((folder / "progress.json").read_text(encoding="utf-8"))
+        self.file, self.save_freq = file, save_freq
+        #: How often the training was continued from a checkpoint, and its wall time, evaluations included.
+        self.resumed, self.seconds = 0, 0.0
+        if save_freq and file.exists():
+            with ZipFile(file) as archive:
+                before = json.loads(archive.read("progress.json"))
             self.resumed, self.seconds = before["resumed"] + 1, before["seconds"]
 
     def _on_training_start(self) -> None:
@@ -396,30 +395,8 @@ class CheckpointCallback(BaseCallback):
     def _on_training_end(self) -> None:
         self.seconds = time.perf_counter() - self._start
 
-    @staticmethod
-    def recover(folder: Path) -> None:
-        """
-        Put the previous checkpoint back if an interruption fell between setting it aside and putting the new one in place.
-        """
-        old = folder.with_suffix(".old")
-        if old.exists() and not folder.exists():
-            os.replace(old, folder)
-
     def _on_step(self) -> bool:
         if self.save_freq and self.n_calls % self.save_freq == 0:
-            part, old = self.folder.with_suffix(".part"), self.folder.with_suffix(".old")
-            for leftover in (part, old):
-                shutil.rmtree(leftover, ignore_errors=True)
-            part.mkdir(parents=True)
-            with replacing(part / "model.zip") as file:
-                self.model.save(file)
-            if isinstance(self.model, OffPolicyAlgorithm):
-                with replacing(part / "replay_buffer.pkl") as file:
-                    self.model.save_replay_buffer(file)
             progress = {"resumed": self.resumed, "seconds": time.perf_counter() - self._start}
-            write_json(part / "progress.json", progress)
-            if self.folder.exists():
-                os.replace(self.folder, old)
-            os.replace(part, self.folder)
-            shutil.rmtree(old, ignore_errors=True)
+            save_checkpoint(self.model, self.file, progress)
         return True

@@ -263,14 +263,3 @@ def test_all_files_of_a_package_are_part_of_the_recipe(tmp_path, monkeypatch):
     before = training.Recipe.of("own_package_a:Mine", "LinearCost-v0", 0, 150, defaults=True)
     (package / "algorithm.py").write_text("from stable_baselines3 import SAC\n\nclass Mine(SAC):\n    changed = True\n")
     assert training.Recipe.of("own_package_a:Mine", "LinearCost-v0", 0, 150, defaults=True).digest != before.digest
-
-
-def test_a_checkpoint_that_was_set_aside_is_put_back(tmp_path):
-    folder, old = tmp_path / "checkpoint", tmp_path / "checkpoint.old"
-    old.mkdir()
-    (old / "model.zip").write_text("previous")
-    training.CheckpointCallback.recover(folder)
-    assert (folder / "model.zip").read_text() == "previous" and not old.exists()
-    old.mkdir()
-    training.CheckpointCallback.recover(folder)
-    assert (folder / "model.zip").read_text() == "previous"
