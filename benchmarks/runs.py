@@ -158,7 +158,7 @@ class Rows:
 
 def save_checkpoint(model: BaseAlgorithm, file: Path, progress: Mapping[str, Any]) -> None:
     """Write all that a training needs to go on as one file, which takes the place of the one before as a whole."""
-    saves = {"model.zip": model.save}
+    saves: dict[str, Callable[[BytesIO], None]] = {"model.zip": model.save}
     if isinstance(model, OffPolicyAlgorithm):
         saves["replay_buffer.pkl"] = model.save_replay_buffer
     with replacing(file) as part, ZipFile(part, "w") as archive:
