@@ -18,6 +18,8 @@ help:  ## list the commands
 logged = ($(1)) > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log >&2; exit 1; }
 comma := ,
 EXTRAS := zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs
+# without the RL Zoo, which needs a newer Stable-Baselines3
+OLDEST_EXTRAS := peers$(comma)onnx$(comma)dev$(comma)docs
 
 # one stamp per state of the packaging files: made again when they change
 $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/pyproject.toml
@@ -48,7 +50,7 @@ test-oldest:  ## those of both packages, with the oldest versions that setup.cfg
 	$(VENV)/oldest/bin/python -m pip install --quiet uv
 	$(VENV)/oldest/bin/python -m pip install --quiet $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)"
 	VIRTUAL_ENV=$(VENV)/oldest $(VENV)/oldest/bin/uv pip install --quiet --resolution lowest-direct \
-		"$(TORCH)" ./battery_env ".[$(EXTRAS)]" "pyparsing==3.2.0"  # later ones warn of old versions of matplotlib
+		"$(TORCH)" ./battery_env ".[$(OLDEST_EXTRAS)]" "pyparsing==3.2.0"  # later ones warn of old versions of matplotlib
 	$(VENV)/oldest/bin/python -m pytest -n 2 --dist worksteal tests/battery_env tests/sb3_lac
 
 format: install  ## black, and what ruff can mend

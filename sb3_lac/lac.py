@@ -5,11 +5,10 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
 from sb3_lac.buffers import Samples
-from sb3_lac.compiled import Metrics, set_gradients, step
+from sb3_lac.compiled import Metrics, polyak_update, set_gradients, step
 from sb3_lac.costs import CostAlgorithm
 from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy, RootCritic, largest_value
 

@@ -7,12 +7,12 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
 from sb3_lac.buffers import HorizonReplayBuffer, Samples
-from sb3_lac.compiled import Metrics, set_gradients, step
+from sb3_lac.compiled import Metrics, polyak_update, set_gradients, step
 from sb3_lac.costs import CostAlgorithm, check_rate
 from sb3_lac.policies import PublishedCnnPolicy, PublishedMultiInputPolicy, PublishedPolicy, largest_value
 
