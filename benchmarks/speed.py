@@ -127,12 +127,12 @@ def measure_updates(rounds: int) -> tuple[pd.DataFrame, str]:
             "SBX's SAC": ready(SBX),
         }
         speeds = race(contestants, rounds, time.process_time)
-        row = {"networks": "-".join(map(str, net_arch)), "updates in a call": per_call}
+        row: dict[str, Any] = {"networks": "-".join(map(str, net_arch)), "updates in a call": per_call}
         tables.append(speeds.assign(**row))
         rows.append(
             {
                 **row,
-                **{name: spread(values, 0) for name, values in speeds.items()},
+                **{str(name): spread(values, 0) for name, values in speeds.items()},
                 "LAC / SAC": spread(speeds["LAC"] / speeds["SAC"], 2),
                 "compiled LAC / SBX's SAC": spread(speeds["compiled LAC"] / speeds["SBX's SAC"], 2),
             }
@@ -153,12 +153,12 @@ def measure_gpu(rounds: int) -> tuple[pd.DataFrame, str]:
             "compiled LAC, one core": ready(LAC, per_call=on_core, device="cpu", compile_update=True),
         }
         speeds = race(contestants, rounds, time.perf_counter)
-        row = {"networks": "-".join(map(str, net_arch)), "batch": batch_size, "updates in a call": per_call}
+        row: dict[str, Any] = {"networks": "-".join(map(str, net_arch)), "batch": batch_size, "updates in a call": per_call}
         tables.append(speeds.assign(**row))
         rows.append(
             {
                 **row,
-                **{name: spread(values, 0 if values.median() > 10.0 else 2) for name, values in speeds.items()},
+                **{str(name): spread(values, 0 if values.median() > 10.0 else 2) for name, values in speeds.items()},
                 "LAC / SAC": spread(speeds["LAC"] / speeds["SAC"], 2),
                 "compiled / not": spread(speeds["compiled LAC"] / speeds["LAC"], 2),
                 "compiled, GPU / one core": spread(speeds["compiled LAC"] / speeds["compiled LAC, one core"], 1),

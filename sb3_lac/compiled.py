@@ -230,8 +230,10 @@ class CompiledUpdate:
         run.__code__ = run.__code__.replace()
         self._made_from = update, device
         self._on_gpu = device.type == "cuda"
-        asked = {"guard_filter_fn": lambda guards: [not (g.is_global or g.guard_type in _UNASKED) for g in guards]}
-        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=self._compile, options=asked)
+        options: dict[str, Any] = {
+            "guard_filter_fn": lambda guards: [not (each.is_global or each.guard_type in _UNASKED) for each in guards]
+        }
+        self._run = th.compile(run, fullgraph=True, dynamic=False, backend=self._compile, options=options)
         # One per group of parameters. A number would be a constant of the graph
         self._learning_rates: list[th.Tensor] = []
         self._space: spaces.Space = _NUMBERS
@@ -248,10 +250,11 @@ class CompiledUpdate:
         # Takes seconds
         from torch import _dynamo as dynamo
 
+        compile_graph: Callable[..., Any] = dynamo.lookup_backend(BACKEND)
         if BACKEND == "inductor" and not self._on_gpu:
-            from sb3_lac.inductor import compile_for_cpu as compile_graph
-        else:
-            compile_graph = dynamo.lookup_backend(BACKEND)
+            from sb3_lac.inductor import compile_for_cpu
+
+            compile_graph = compile_for_cpu
         print("sb3_lac compiles the update of LAC: this takes half a minute to minutes.", file=sys.stderr, flush=True)
         graph = Graph(compile_graph(traced, inputs), self._sampled, self._on_gpu)
 

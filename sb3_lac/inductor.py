@@ -1,7 +1,7 @@
 """What PyTorch's compiler is told about the small networks of an update on a CPU, where it would take them for large ones."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch as th
@@ -10,7 +10,7 @@ from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_file
 from torch._inductor.pattern_matcher import Arg, CallFunction, Match, PatternMatcherPass, register_graph_pattern
 
 _aten = th.ops.aten
-_passes = PatternMatcherPass(pass_name="sb3_lac")  # type: ignore[no-untyped-call]
+_passes = PatternMatcherPass(pass_name="sb3_lac")
 
 
 def _product(left: th.Tensor, right: th.Tensor) -> th.Tensor:
@@ -60,7 +60,7 @@ class _SmallNetworks(CustomGraphPass):
         return get_hash_for_files((__file__,))
 
 
-def compile_for_cpu(traced: th.fx.GraphModule, inputs: Sequence[th.Tensor]) -> Callable[..., Sequence[th.Tensor]]:
+def compile_for_cpu(traced: th.fx.GraphModule, inputs: Sequence[th.Tensor]) -> Any:
     """Make code of a graph, with a loop of calls in C++."""
     options = {"cpp_wrapper": True, "post_grad_custom_post_pass": _SmallNetworks()}
     return compile_fx(traced, inputs, config_patches=options)

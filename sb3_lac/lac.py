@@ -194,7 +194,7 @@ class LAC(CostAlgorithm):
         if _init_setup_model:
             self._setup_model()
 
-    def _target_values(self, replay_data: Samples, next_actions: th.Tensor) -> th.Tensor:
+    def _target_values(self, replay_data: Any, next_actions: th.Tensor) -> th.Tensor:
         """What the critic learns the root of: values of ``L``, relative to its offset."""
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma

@@ -181,7 +181,7 @@ class PublishedLAC(CostAlgorithm):
     def n_costs(self) -> float:
         return super().n_costs if self.horizon is None else self.horizon
 
-    def _candidate(self, replay_data: Samples, costs: th.Tensor) -> th.Tensor:
+    def _candidate(self, replay_data: Any, costs: th.Tensor) -> th.Tensor:
         """The Lyapunov candidate, the target of ``L``."""
         if self.horizon is not None:
             # A cost is the bound less the reward

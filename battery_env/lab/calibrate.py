@@ -259,7 +259,7 @@ def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Esti
         or low_C < (1.0 - _AT_BOUND) * estimate.q_mobile < (1.0 - _AT_BOUND) ** 2 * high_C
     ):
         return estimate
-    nothing = dict.fromkeys(("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"), float("nan"))
+    nothing: dict[str, Any] = dict.fromkeys(("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"), float("nan"))
     reason = estimate.reason
     if drawn_C < Q_MOBILE.limits[0]:
         least_mAh = Q_MOBILE.limits[0] / 3.6
