@@ -40,11 +40,11 @@ from benchmarks.study import Study, digits, markdown, new_panels, with_interval
 TASKS = {
     "Pendulum-v1": 20_000,
     "MountainCarContinuous-v0": 20_000,
-    "InvertedPendulum-v5": 10_000,
+    "InvertedPendulum-v5": 20_000,
     "InvertedDoublePendulum-v5": 20_000,
-    "Reacher-v5": 10_000,
-    "Pusher-v5": 10_000,
-    "Hopper-v5": 20_000,
+    "Reacher-v5": 20_000,
+    "Pusher-v5": 20_000,
+    "Hopper-v5": 50_000,
 }
 #: Algorithms by their names on the command line: what readers call them, and the class.
 ALGORITHMS = {

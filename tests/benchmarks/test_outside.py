@@ -53,7 +53,7 @@ def test_tasks_are_aggregated_by_the_probability_alone():
 
 
 def test_order_and_settings_of_the_study():
-    assert outside.run_of("Hopper-v5", "sac", 1).timesteps == 20_000 and outside.run_of("Hopper-v5", "lac", 1).settings == {}
+    assert outside.run_of("Hopper-v5", "sac", 1).timesteps == 50_000 and outside.run_of("Hopper-v5", "lac", 1).settings == {}
     assert outside.run_of("Pendulum-v1", "lac", 1).settings == {}
     assert outside.run_of("Pendulum-v1", "lac_common", 1).settings["n_envs"] == 4
     assert outside.run_of("Pendulum-v1", "sac", 1).settings == {"learning_rate": 1e-3}
