@@ -15,7 +15,7 @@ import zlib
 from codecs import getincrementaldecoder
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 
@@ -64,6 +64,10 @@ class Layout(NamedTuple):
     names: list[str]
     layers: int  # so many columns at the left number what lies above a row, as its cycle and its step
     rows: list[list[str]]  # fields of the first lines below the header
+
+
+class TooLargeError(ValueError):
+    """A file, or what is packed in it, is beyond a bound."""
 
 
 class Opened(NamedTuple):
@@ -136,14 +140,16 @@ def _text_of(path: Path, file_format: FileFormat) -> bytes:
 
 def _check_rows(count: int, size: int) -> None:
     if count > max(_MOST_ROWS, size // _LEAST_ROW_BYTES):
-        raise ValueError(
+        raise TooLargeError(
             f"{count} rows are more than the {_MOST_ROWS} that are read of a file of {size} bytes: cut it in parts"
         )
 
 
 def _check_unpacked(count: int) -> None:
     if count > LARGEST_UNPACKED_BYTES:
-        raise ValueError(f"unpacked it has more than the {LARGEST_UNPACKED_BYTES >> 20} MiB that are read: unpack it by hand")
+        raise TooLargeError(
+            f"unpacked it has more than the {LARGEST_UNPACKED_BYTES >> 20} MiB that are read: unpack it by hand"
+        )
 
 
 def _read_text(content: bytes, layout: Layout, found: Recognised) -> pd.DataFrame:
@@ -191,7 +197,7 @@ def _content(path: Path) -> bytes:
                 _check_rows(lines, count)
                 if path.suffix.lower() in PACKED_SUFFIXES:
                     _check_unpacked(count)
-    except (FileNotFoundError, IsADirectoryError, PermissionError):
+    except (FileNotFoundError, IsADirectoryError, PermissionError, TooLargeError):
         raise
     except Exception as error:  # the unpackers raise whatever the damage leads them to
         raise ValueError(f"the file is damaged: {str(error).strip() or type(error).__name__}") from error
@@ -378,7 +384,7 @@ def _reading(kind: str, extra: str) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except FileNotFoundError:
+    except (FileNotFoundError, TooLargeError):
         raise
     except ImportError as error:
         raise ImportError(f"{kind} files need an extra: pip install 'battery_env[{extra}]' ({error})") from error
@@ -402,10 +408,10 @@ def _sheets(path: Path) -> Iterator[tuple[str, Iterable[Sequence[Any]]]]:
     if path.read_bytes()[:4] == _WORKBOOKS[0]:
         import openpyxl
 
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-        for sheet in book.worksheets:
-            sheet.reset_dimensions()
-            yield sheet.title, sheet.iter_rows(values_only=True)
+        with closing(openpyxl.load_workbook(path, read_only=True, data_only=True)) as book:
+            for sheet in book.worksheets:
+                sheet.reset_dimensions()
+                yield sheet.title, sheet.iter_rows(values_only=True)
     else:
         import xlrd
 
@@ -445,7 +451,7 @@ def _read_sheet(title: str, rows: Iterable[Sequence[Any]], file_format: FileForm
         while fields and not fields[-1]:
             fields.pop()
         if len(fields) > _MOST_COLUMNS:
-            raise ValueError(f"{len(fields)} columns in sheet {title!r} are more than the {_MOST_COLUMNS} that are read")
+            raise TooLargeError(f"{len(fields)} columns in sheet {title!r} are more than the {_MOST_COLUMNS} that are read")
         if fields:
             kept.append(fields)
             size += sum(map(len, fields)) + 60 * len(fields)  # as Python keeps text
