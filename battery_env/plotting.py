@@ -14,14 +14,14 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry.ends import BAND
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.cell_fit import CellFit
-from battery_env.estimators.cramer_rao import CramerRaoBound, Sensitivities
+from battery_env.estimators.cramer_rao import CramerRaoBound
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
@@ -72,10 +72,6 @@ _LIFE_COLUMNS = {
 }
 # Distance of the bars of cells, as a share of the axis.
 _BAR_STEP = 0.02
-# q_mobile follows the capacity if their correlation is this close over so many discharges or more.
-_FOLLOWS, _LEAST_POINTS = 0.99, 5
-# What q_mobile changes is drawn on a scale that is linear within this, mV, and logarithmic beyond: three decades, from zero.
-_LINEAR_MV = 0.1
 _NAMES = re.compile("|".join(rf"\b{name}\b" for name in COLOUR_OF), flags=re.IGNORECASE)
 _COLOUR_OF_LOWER = {name.lower(): colour for name, colour in COLOUR_OF.items()}
 
@@ -325,7 +321,6 @@ def plot_life(table: pd.DataFrame) -> Figure:
         ``drawn_Ah`` and ``settled``, as the command line writes it, and if there are several cells with ``cell``. Where each
         cell has one discharge in it, the rows are taken for the discharges of one cell. They are drawn over their cycles, or
         over their order where the cycles are not known
-    :return: the figure; its title says so if ``capacity_Ah`` is there and ``q_mobile`` follows it
     :raises ValueError: for estimates of more than one ``method``, whose ``r_o`` mean different things
     """
     if "method" in table and table["method"].nunique() > 1:
@@ -361,24 +356,10 @@ def plot_life(table: pd.DataFrame) -> Figure:
             # the standard deviations of what is not settled may be of any size
             reach[~table["settled"].to_numpy(dtype=np.bool_) | np.isnan(reach)] = 0.0
             axes.set_ylim(*_limits([values - reach, values + reach]))
-    panels[0].set_title(title_of_life(list(lives.values())), fontsize=10)
     panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     panels[-1].set_xlabel("cycle" if is_numbered else "discharge")
     _life_legend(figure, table)
     return _finished(figure, *panels)
-
-
-def title_of_life(cells: Sequence[pd.DataFrame]) -> str:
-    """That ``q_mobile_C`` follows ``capacity_Ah`` in the tables of cells; empty where it does not, or nobody can say."""
-    correlations = []
-    for table in cells:
-        known = table[table["settled"].astype(bool)].reindex(columns=["q_mobile_C", "capacity_Ah"]).dropna()
-        correlations.append(known["q_mobile_C"].corr(known["capacity_Ah"]) if len(known) >= _LEAST_POINTS else np.nan)
-    least = float(np.min(correlations))
-    if not least >= _FOLLOWS:
-        return ""
-    shown = min(np.floor(1e3 * least) / 1e3, 0.999)
-    return f"{Q_MOBILE.symbol} follows the measured capacity (r > {shown:.3f})"
 
 
 def _life_legend(figure: Figure, table: pd.DataFrame) -> None:
@@ -457,26 +438,6 @@ def _limits(shown: Sequence[FloatArray]) -> tuple[float, float]:
     low, high = float(ends.min()), float(ends.max())
     room = max(_ROOM * (high - low), 1e-3 * abs(high))
     return low - room, high + room
-
-
-def plot_sensitivities(slopes: Mapping[str, Sensitivities], at: Estimate) -> Figure:
-    """
-    How much the voltage says about either parameter over a discharge: what 1 % more of it changes.
-
-    :param slopes: what :func:`battery_env.estimators.cramer_rao.sensitivities` returned, by name for the legend
-    :param at: the parameters of the discharges
-    """
-    figure = new_figure(6.4, 4.6)
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    for colour, (name, slope) in coloured(slopes.items()):
-        upper.plot(slope.time_s, 10.0 * at.q_mobile * slope.by_q_mobile_V_per_C, color=colour, lw=1.3, label=name)
-        lower.plot(slope.time_s, 10.0 * at.r_o * slope.by_r_o_A, color=colour, lw=1.3, label=name)
-    upper.set_yscale("symlog", linthresh=_LINEAR_MV, linscale=0.5)
-    upper.yaxis.set_major_formatter(ScalarFormatter())
-    upper.set_ylabel(f"1 % more {Q_MOBILE.symbol} (mV)")
-    upper.legend(frameon=False, fontsize=9)
-    lower.set(xlabel="time (s)", ylabel=f"1 % more {R_O.symbol} (mV)")
-    return _finished(figure, upper, lower)
 
 
 def _finished(figure: Figure, *panels: Axes) -> Figure:

@@ -26,7 +26,7 @@ from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
 from battery_env.estimators import CellFit, Estimator, ExtendedKalmanFilter, LeastSquares, fit_cell
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
-from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, new_figure, plot_cell_fit, title_of_life
+from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, new_figure, plot_cell_fit
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.records.model import RecordModel
 from benchmarks.study import (
@@ -211,7 +211,7 @@ def plot_life(whole: pd.DataFrame) -> Figure:
         upper.plot(part["cycle"], part["capacity_Ah"], ".", ms=3.5, color=measured, label="capacity to 2.7 V, measured")
         impedance_mohm = 1e3 * (part["Re_ohm"] + part["Rct_ohm"])
         lower.plot(part["cycle"], impedance_mohm, ".", ms=3.5, color=measured, label="$R_e + R_{ct}$, impedance tests")
-        upper.set_title(f"{cell}\n{title_of_life([part])}", fontsize=10)
+        upper.set_title(cell, fontsize=10)
         lower.set_xlabel("cycle")
         upper.legend(frameon=False, loc="upper right", fontsize=9)
         lower.legend(frameon=False, loc="upper left", fontsize=9)

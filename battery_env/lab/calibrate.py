@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
+from difflib import get_close_matches
+from functools import partial
 from math import hypot
 from numbers import Real
 from pathlib import Path
@@ -12,6 +15,7 @@ from typing import Any, NamedTuple, overload
 
 import numpy as np
 import pandas as pd
+from typing_extensions import Unpack
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K
@@ -27,9 +31,10 @@ from battery_env.estimators.estimator import ModelNow
 from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.lab.forecast import Forecast, forecast
 from battery_env.lab.readers.columns import FileFormat
-from battery_env.lab.readers.discharges import each_usable
+from battery_env.lab.readers.discharges import each_usable, read_recordings
 from battery_env.lab.report import Calibration
-from battery_env.lab.settings import Method, Settings
+from battery_env.lab.settings import Method, Settings, SettingsOptions
+from battery_env.lab.sources import find_sources, read_source
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.estimator import PolicyEstimator
@@ -52,32 +57,27 @@ _AT_BOUND = 1e-3
 _BAND_SD = 1.645
 
 
+class Options(SettingsOptions, total=False):
+    """Keywords of :func:`calibrate`: those of :class:`Settings`, and of :func:`battery_env.read_discharges`."""
+
+    columns: Mapping[str, str] | None
+    units: Mapping[str, str] | None
+    discharge_is_negative: bool | None
+    ignore: Collection[str]
+
+
 @overload
-def calibrate(source: Discharge, settings: Settings | None = None, **options: Any) -> Calibration: ...
+def calibrate(source: Discharge, settings: Settings | None = None, **options: Unpack[SettingsOptions]) -> Calibration: ...
 
 
 @overload
 def calibrate(
-    source: pd.DataFrame | str | Path,
-    settings: Settings | None = None,
-    *,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    discharge_is_negative: bool | None = None,
-    ignore: Collection[str] = (),
-    **options: Any,
+    source: pd.DataFrame | str | Path, settings: Settings | None = None, **options: Unpack[Options]
 ) -> list[Calibration]: ...
 
 
 def calibrate(
-    source: Discharge | pd.DataFrame | str | Path,
-    settings: Settings | None = None,
-    *,
-    columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    discharge_is_negative: bool | None = None,
-    ignore: Collection[str] = (),
-    **options: Any,
+    source: Discharge | pd.DataFrame | str | Path, settings: Settings | None = None, **options: Any
 ) -> Calibration | list[Calibration]:
     """
     Calibrate the model to recorded discharges, as the command line does.
@@ -91,22 +91,29 @@ def calibrate(
     nothing was drawn though the samples beside say so, its capacity is not known either. Its surroundings, and its temperature
     at the start, are those measured at load-on; a model that departs far from the temperatures measured later is warned of.
 
-    :param source: one discharge, whole or in progress; or a table or a file of them, see
-        :func:`battery_env.read_discharges`
+    :param source: one discharge, whole or in progress; a table or a file of them, see :func:`battery_env.read_discharges`; or
+        what the command takes: a folder, ``"life.csv:2"``, or a bundled cell, as ``"B0005:100"``
     :param settings: how to look at them; ``None``: as ``options`` say
-    :param columns: of a table or a file, as ``read_discharges`` takes it
-    :param units: likewise
-    :param discharge_is_negative: likewise
-    :param ignore: likewise
-    :param options: of :class:`Settings`, by name; ``cell`` may be what ``fit_cell`` found
-    :return: what a discharge says; of a table or a file a list, in which those that cannot be used are left out with a warning
+    :param options: of :class:`Settings`, by name: ``cut_off_V``, ``nominal_Ah``, ``initial_soc``, ...; ``cell`` may be what
+        ``fit_cell`` found. Of tables and files what ``read_discharges`` takes, too, but the tester
+    :return: what a discharge says; of other sources a list, without what cannot be used, of which warnings say why
     :raises ValueError: if none can be used
+    :raises TypeError: for an option that there is not
     """
+    known = (SettingsOptions if isinstance(source, Discharge) else Options).__annotations__
+    for name in options.keys() - known.keys():
+        meant = get_close_matches(name, known, 1)
+        raise TypeError(f"calibrate takes no {name!r}: " + (f"did you mean {meant[0]}?" if meant else f"give {[*known]}"))
+    of_file = {name: options.pop(name) for name in options.keys() - SettingsOptions.__annotations__.keys()}
     settings = Settings.for_cell(**options) if settings is None else replace(settings, **options)
     if isinstance(source, Discharge):
         return calibrated(source, settings)
-    file_format = FileFormat(columns, units, discharge_is_negative, ignore)
-    return each_usable(lambda each: calibrated(each, settings), source, file_format)
+    file_format = FileFormat(**of_file)
+    sources = find_sources([os.fspath(source)]) if isinstance(source, str | os.PathLike) else []
+    readers = {each.argument: partial(read_source, each, file_format) for each in sources}
+    return each_usable(
+        lambda each: calibrated(each, settings), readers or {"DataFrame": partial(read_recordings, source, file_format)}
+    )
 
 
 class _LoadedPart(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 
@@ -41,6 +41,27 @@ _NOT_FOR_POLICIES = (
 )
 # Nor may be said beside a path: it tells which of all go together, at the temperature of its lives.
 _NOT_WITH_PATH = ("parameters", "ambient_C")
+
+
+class SettingsOptions(TypedDict, total=False):
+    """Keywords of :class:`Settings`; ``cell`` may be all that is known of it, as :meth:`Settings.for_cell` takes it."""
+
+    method: Method | None
+    parameters: tuple[str, ...]
+    cut_off_V: float
+    prior_q_mobile_C: tuple[float, float] | None
+    mismatch_V: float
+    current_gain_sd: float
+    thermal: bool
+    ambient_C: float | None
+    nominal_Ah: float | None
+    cell: CellFit | AgingPath | CellParameters | None
+    cell_currents_A: tuple[float, float] | None
+    cell_q_mobile_C: tuple[float, float] | None
+    cell_sd_r_o_ohm: float
+    path: AgingPath | None
+    q_mobile_bounds_C: tuple[float, float] | None
+    initial_soc: InitialSoc | Literal["rest"]
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 import json
+import shutil
 import subprocess
 import sys
 from contextlib import redirect_stdout
-from dataclasses import replace
+from dataclasses import fields, replace
 from io import StringIO
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from battery_env.estimators.reasons import Reason
 from battery_env.lab import batch
 from battery_env.lab.calibrate import calibrate as calibrated
 from battery_env.lab.command_line import main
+from battery_env.lab.settings import SettingsOptions
 from battery_env.lab.sources import find_sources
 from battery_env.loads import constant
 
@@ -503,6 +505,23 @@ class TestInPython:
         assert repr(found).count("\n") == 0 and "<discharge 2 " in repr(found)
         table = pd.DataFrame(each.row() for each in found)
         assert list(table["cycle"]) == [1, 2, 3] and table["settled"].all()
+
+    def test_cells_numbers_and_folders_are_found_as_on_the_command_line(self, lab, tmp_path, terminal):
+        for source in ("B0005:100", f"{lab}/life.csv:2"):
+            (found,) = battery_env.calibrate(source)
+            assert str(found).splitlines()[1:] == terminal.shows(source).splitlines()[1:]
+        shutil.copy(lab / "life.csv", tmp_path / "life.csv")
+        (tmp_path / "damaged.csv").write_text("no record")
+        with pytest.warns(UserWarning, match="damaged.csv.* It is left out"):
+            assert [each.cycle for each in battery_env.calibrate(tmp_path)] == [1, 2, 3]
+        with pytest.raises(FileNotFoundError, match="no file 'B0099:1'; the bundled cells are given as"):
+            battery_env.calibrate("B0099:1")
+
+    def test_its_keywords_are_those_of_the_settings_and_one_that_there_is_not_is_told(self):
+        assert set(SettingsOptions.__annotations__) == {field.name for field in fields(Settings)}
+        for name, said in (("nominal", "did you mean nominal_Ah"), ("x", "give .*'cut_off_V'.*'ignore'")):
+            with pytest.raises(TypeError, match=f"calibrate takes no '{name}': {said}"):
+                battery_env.calibrate("B0005:100", **{name: 2.0})
 
     def test_what_cannot_be_used_is_left_out_with_a_warning(self, lab):
         table = pd.read_csv(lab / "life.csv")

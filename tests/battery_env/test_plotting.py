@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from battery_env import RecordModel, SensorErrors, forecast, simulate
-from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace, sensitivities
+from battery_env.estimators import CramerRaoBound, Estimate, EstimateTrace
 from battery_env.plotting import (
     COLOUR_OF,
     COLOURS,
@@ -17,7 +17,6 @@ from battery_env.plotting import (
     plot_estimates,
     plot_learning_curves,
     plot_life,
-    plot_sensitivities,
     plot_true_against_inferred,
 )
 from battery_env.records import Samples
@@ -101,13 +100,6 @@ def test_estimates_have_a_panel_per_parameter_bands_and_a_dotted_part_that_is_no
         plot_estimates(traces, bound=bound)
 
 
-def test_sensitivities_are_drawn_as_what_one_percent_more_changes_in_millivolts(record):
-    slopes = sensitivities(record)
-    upper, lower = plot_sensitivities({"2 A": slopes}, Estimate(6000.0, 0.15)).axes
-    np.testing.assert_allclose(upper.lines[0].get_ydata(), 1e3 * 60.0 * slopes.by_q_mobile_V_per_C)
-    np.testing.assert_allclose(lower.lines[0].get_ydata()[100:], 1e3 * 0.0015 * -2.0, atol=1e-3)
-
-
 def life(cells):
     rows = [{"cell": cell, "cycle": cycle, "q_mobile_C": 7000.0 - 100.0 * cycle} for cell in cells for cycle in (2, 5, 9)]
     return pd.DataFrame(rows).assign(sd_q_mobile_C=50.0, r_o_ohm=0.1, sd_r_o_ohm=0.02, drawn_Ah=1.8, settled=True)
@@ -147,17 +139,6 @@ def test_the_cycles_of_files_are_the_axis_and_one_method_is_drawn():
     assert plot_life(table.drop(columns="cell").assign(cycle=None)).axes[-1].get_xlabel() == "discharge"
     with pytest.raises(ValueError, match="one method, got kalman and least-squares"):
         plot_life(table.assign(method=["kalman", "kalman", "least-squares"]))
-
-
-@pytest.mark.parametrize(("noise_Ah", "follows"), [(0.0, True), (0.5, False)])
-def test_the_title_says_that_q_max_follows_the_capacity_only_if_it_does(noise_Ah, follows):
-    table = pd.concat([life(["A"])] * 3, ignore_index=True)
-    table["cycle"] += 10 * (table.index // 3)
-    table["q_mobile_C"] = 7000.0 - 10.0 * table["cycle"]
-    drawn_Ah = table["q_mobile_C"] / 3800.0 + noise_Ah * np.random.default_rng(0).standard_normal(len(table))
-    title = plot_life(table.assign(capacity_Ah=drawn_Ah)).axes[0].get_title()
-    assert title == ("$q_{max}$ follows the measured capacity (r > 0.999)" if follows else "")
-    assert plot_life(table).axes[0].get_title() == ""
 
 
 def test_a_name_has_one_colour_in_all_figures():

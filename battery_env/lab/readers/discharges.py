@@ -115,22 +115,31 @@ def read_discharges(
     """
     known = None if tester is None else find_tester(tester)
     file_format = FileFormat(columns, units, discharge_is_negative, ignore, known)
-    return each_usable(lambda discharge: discharge, source, file_format)
+    return each_usable(lambda each: each, {_name_of(source): lambda: read_recordings(source, file_format)})
 
 
-def each_usable(use: Callable[[Discharge], Made], source: str | Path | pd.DataFrame, file_format: FileFormat) -> list[Made]:
-    """What is made of each discharge. One that cannot be used is left out with a warning; if none can, that is an error."""
-    made, reasons = [], []
-    for recording in read_recordings(source, file_format):
+def each_usable(use: Callable[[Discharge], Made], readers: Mapping[str, Callable[[], list[Recording]]]) -> list[Made]:
+    """
+    What is made of each discharge, by sources and what reads each. What cannot be used is left out with a warning; if nothing
+    can, that is an error.
+    """
+    made, errors = [], []
+    for name, read in readers.items():
         try:
-            made.append(use(recording.discharge()))
-        except (TypeError, ValueError) as error:
-            number = f"discharge {recording.meta['cycle']}: " if "cycle" in recording.meta else ""
-            reasons.append(f"{_name_of(source)}: {number}{error}")
+            recordings = read()
+        except (OSError, TypeError, ValueError) as error:
+            errors.append(error)
+            continue
+        for recording in recordings:
+            try:
+                made.append(use(recording.discharge()))
+            except (TypeError, ValueError) as error:
+                number = f"discharge {recording.meta['cycle']}: " if "cycle" in recording.meta else ""
+                errors.append(ValueError(f"{name}: {number}{error}"))
     if not made:
-        raise ValueError(reasons[0])
-    for reason in reasons:
-        warnings.warn(f"{reason} It is left out.", stacklevel=3)
+        raise errors[0]
+    for error in errors:
+        warnings.warn(f"{error} It is left out.", stacklevel=3)
     return made
 
 
