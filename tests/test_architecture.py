@@ -195,10 +195,7 @@ def test_every_public_name_of_battery_env_is_the_one_that_type_checkers_see():
 
 
 # names of modules that differ from those of the distributions that bring them
-DISTRIBUTIONS = {
-    **{"sb3_contrib": "sb3_contrib", "sbx": "sbx-rl", "yaml": "rl_zoo3", "optuna": "rl_zoo3"},
-    "typing_extensions": "typing-extensions",
-}
+DISTRIBUTIONS = {"sb3_contrib": "sb3_contrib", "sbx": "sbx-rl", "yaml": "rl_zoo3", "optuna": "rl_zoo3"}
 STANDARD = set(sys.stdlib_module_names)
 
 
