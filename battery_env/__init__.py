@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from battery_env.lab.readers.discharges import read_discharge_csv, read_discharges
     from battery_env.lab.report import Calibration
     from battery_env.lab.settings import Settings
-    from battery_env.policies.estimator import PolicyEstimator
     from battery_env.policies.onnx import OnnxPolicy
+    from battery_env.policies.policy_estimator import PolicyEstimator
     from battery_env.records.discharge import Discharge, load_nasa_discharges
     from battery_env.records.model import RecordModel
     from battery_env.sensors import RandomSensorErrors, SensorErrors
@@ -58,7 +58,7 @@ _MODULES = {
     "lab.readers.discharges": ("read_discharge_csv", "read_discharges"),
     "lab.report": ("Calibration",),
     "lab.settings": ("Settings",),
-    "policies.estimator": ("PolicyEstimator",),
+    "policies.policy_estimator": ("PolicyEstimator",),
     "policies.onnx": ("OnnxPolicy",),
     "records.discharge": ("Discharge", "load_nasa_discharges"),
     "records.model": ("RecordModel",),

@@ -191,8 +191,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
             raise TypeError(f"path must be an AgingPath, got {type(path).__name__}")
         cells = path.draw(n, seed)
         drawn, index = _drawn_loads(loads, n, np.random.default_rng([seed, 1]))
-        known = (cells.factors, cells.equilibrium_V)
-        made = TrajectoryDataset.simulated(cells.q_mobile, cells.r_o, drawn, index, dt_s, thermal, path.cell, *known)
+        made = TrajectoryDataset.simulated(
+            cells.q_mobile, cells.r_o, drawn, index, dt_s, thermal, path.cell, cells.factors, cells.equilibrium_V
+        )
         return replace(made, description={"made_by": "along", "n": n, "seed": seed})
 
     @staticmethod
@@ -350,8 +351,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         voltage, current = columns
         state[0] = self.checkpoint[self.checkpoint_start[n]]
         # no cut-off: a data set of recorded trajectories may hold samples below it
-        run = (load, self.q_mobile[n], self.r_o[n], self.dt_s, -np.inf, self.load_unit == "power", self.thermal)
-        if roll_out(*run, self.packed(np.array([n])), state, columns) < samples:
+        q, r, is_power, packed = self.q_mobile[n], self.r_o[n], self.load_unit == "power", self.packed(np.array([n]))
+        if roll_out(load, q, r, self.dt_s, -np.inf, is_power, self.thermal, packed, state, columns) < samples:
             raise ValueError(f"trajectory {n} cannot be simulated again: it was made with another load or other constants")
         return Trajectory(
             time_s=self.dt_s * np.arange(samples, dtype=np.float64),
@@ -535,8 +536,8 @@ def _discharged(
         cells = np.flatnonzero(load_index == k)
         for n in cells.tolist():
             state[0] = start[n]
-            run = (profile, q_mobile[n], r_o[n], dt_s, cell.VEOD, is_power, thermal)
-            samples[n] = roll_out(*run, _packed(cell, factors[[n]], equilibrium_V[[n]]), state, columns)
+            packed = _packed(cell, factors[[n]], equilibrium_V[[n]])
+            samples[n] = roll_out(profile, q_mobile[n], r_o[n], dt_s, cell.VEOD, is_power, thermal, packed, state, columns)
             if samples[n] < _MIN_SAMPLES:
                 raise ValueError(
                     f"trajectory {n} (q_mobile {q_mobile[n]:g} C, r_o {r_o[n]:g} ohm) ends after {samples[n]} samples, at "

@@ -48,7 +48,7 @@ from battery_env.lab.settings import Settings
 from battery_env.loads import Load, RandomLoad, RandomPiecewise, constant
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import coloured
-from battery_env.policies.estimator import Predictor
+from battery_env.policies.policy_estimator import Predictor
 from battery_env.policies.pretrained import file_stem, write_card
 from battery_env.records import drawn
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
@@ -107,7 +107,7 @@ class Loads(RandomLoad):
         return RandomPiecewise((0.5, 3.0), unit="current")(rng)
 
 
-class Together:
+class MeanPolicy:
     """Several policies as one: the mean of their actions. None at all leave both parameters to the fit that they would see."""
 
     def __init__(self, policies: Sequence[Predictor]) -> None:
@@ -173,7 +173,7 @@ def learned(judged: str, every: int, method: str, algo: str, seeds: Sequence[int
     """The discharges of a cell by policies that learned along the path of the other one, their actions averaged."""
     path = path_of([CELLS[judged]], folder)[0]
     policies = [train_or_load(recipe_of(algo, [CELLS[judged]], seed, folder), folder / "models") for seed in seeds]
-    estimator = PolicyEstimator(Together(policies), ENV_ID, path=path, **OPTIONS)
+    estimator = PolicyEstimator(MeanPolicy(policies), ENV_ID, path=path, **OPTIONS)
     wholes = [_Whole(each) for each in load_nasa_discharges(judged)[1::every]]
     rows = []
     for share in SHARES:

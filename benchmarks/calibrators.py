@@ -32,7 +32,7 @@ from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import LABELS, coloured, new_figure
-from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.policies.pretrained import pretrained_card
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
@@ -168,7 +168,7 @@ class Comparison:
     by_parameter: bool = False
 
 
-class Follow:
+class FollowTheFit:
     """No policy: it makes the step of the fit that the observation holds."""
 
     def predict(self, observation: FloatArray, /, *, deterministic: bool = False) -> tuple[FloatArray, None]:
@@ -185,7 +185,7 @@ SHIPPED = (
         policy=pretrained_card(ENV_ID)["sha256"][:8],
     ),
     Calibrator(
-        "the fit that LAC sees, no policy", "model", lambda unknown, told_V: PolicyEstimator(Follow(), ENV_ID, **OPTIONS)
+        "the fit that LAC sees, no policy", "model", lambda unknown, told_V: PolicyEstimator(FollowTheFit(), ENV_ID, **OPTIONS)
     ),
 )
 

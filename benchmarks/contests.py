@@ -27,9 +27,9 @@ from battery_env.plotting import (
     plot_true_against_inferred,
     save_figure,
 )
-from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.sensors import RandomSensorErrors, SensorErrors
-from battery_env.tasks.full_state.task import FullStateTask
+from battery_env.tasks.full_state.full_state_task import FullStateTask
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.study import EVALUATION_SEED, SYMBOLS, Study, Tables, digits, side_by_side, with_interval, with_spread
 from benchmarks.training import registered_id

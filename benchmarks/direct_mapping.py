@@ -32,7 +32,7 @@ from battery_env.estimators.closed_form import ClosedForm
 from battery_env.estimators.estimator import Estimator
 from battery_env.evaluation import evaluate
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.tasks.full_state.layout import LITERAL, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.study import (

@@ -27,7 +27,7 @@ import pandas as pd
 
 from battery_env.evaluation import evaluate
 from battery_env.files import replacing
-from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.policies.pretrained import file_stem, policy_of_file, write_card
 from battery_env.tasks.data import standard_dataset
 from benchmarks.contests import HELD_OUT, SENSORS

@@ -29,7 +29,7 @@ from battery_env.files import replacing
 from battery_env.loads import constant
 from battery_env.tasks.data import standard_dataset
 from battery_env.tasks.env import CalibrationEnv
-from battery_env.tasks.full_state.task import FullStateTask
+from battery_env.tasks.full_state.full_state_task import FullStateTask
 from battery_env.tasks.registration import TASKS
 from battery_env.trajectories import TrajectoryDataset
 from docs.environment_pictures import EPISODES

@@ -8,7 +8,7 @@ import pytest
 from battery_env import ClosedForm, TrajectoryDataset, evaluate, plotting
 from battery_env.loads import constant
 from battery_env.tasks.env import CalibrationEnv, task_class
-from battery_env.tasks.full_state.task import BatteryQmax
+from battery_env.tasks.full_state.full_state_task import BatteryQmax
 from battery_env.tasks.registration import TASKS
 from benchmarks.control import DISTURBANCES
 from docs import environment_pages

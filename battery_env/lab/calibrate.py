@@ -37,7 +37,7 @@ from battery_env.lab.settings import Method, Settings, SettingsOptions
 from battery_env.lab.sources import find_sources, read_source
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.parameters import Q_MOBILE
-from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import STEADY_S, ExpectedCurrent, Samples, drawn, expected_current, history_of, mean_current_A
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
@@ -132,27 +132,24 @@ class _LoadedPart(NamedTuple):
     load: ExpectedCurrent
 
 
-class Ahead(NamedTuple):
-    """What is asked of the time after a record."""
+def calibrated(
+    discharge: Discharge, settings: Settings, load: LoadToCome | None = None, samples: int = 1000, end_is_asked: bool = False
+) -> Calibration:
+    """
+    What one discharge says, and of one in progress what comes after it.
 
-    load: LoadToCome | None = None  # to come; ``None``: as so far
-    samples: int = 1000  # of what may come
-    is_asked: bool = False  # whether an end that cannot be told is an error, and not only unknown
-
-
-_GOES_ON = Ahead()
-
-
-def calibrated(discharge: Discharge, settings: Settings, ahead: Ahead = _GOES_ON) -> Calibration:
-    """What one discharge says, and of one in progress what comes after it."""
+    :param load: to come; ``None``: as so far
+    :param samples: of what may come
+    :param end_is_asked: whether an end that cannot be told is an error, and not only unknown
+    """
     is_whole = not np.isnan(discharge.eod_time_s(settings.cut_off_V))
     known = settings if is_whole else settings.with_nominal_prior()
     part = _look_at(discharge, known)
-    estimate, method, model, now = _estimate(part, known, ahead.load)
+    estimate, method, model, now = _estimate(part, known, load)
     # a cell in progress has not ended, however low its model comes in the pulses before
     cut_off_V, current_A = (-np.inf, 0.0) if part.in_progress else (settings.cut_off_V, part.load.mean_A)
     shown = model.forecast(part.record, estimate, cut_off_V, current_A)
-    end = _end(part, estimate, replace(known, method=method), now or model, shown, ahead)
+    end = _end(part, estimate, replace(known, method=method), now or model, shown, load, samples, end_is_asked)
     end_C, model_end_C = _end_temperatures(part.record, shown)
     charge = _charge(part, settings, estimate, end)
     if part.start.reason or part.more_C or not _is_all_logged(part, shown, estimate):
@@ -280,12 +277,13 @@ def _end(
     settings: Settings,
     model: RecordModel | ModelNow,
     shown: VoltageForecast,
-    ahead: Ahead,
+    load: LoadToCome | None,
+    samples: int,
+    is_asked: bool,
 ) -> Forecast | None:
     """What may come after a record; ``None`` if nothing can be told, or is asked of a record that has ended."""
-    if not (part.in_progress or ahead.is_asked):
+    if not (part.in_progress or is_asked):
         return None
-    load = ahead.load
     if settings.prior_q_mobile_C is None and settings.cell_q_mobile_C is not None:
         estimate = estimate.within(*settings.cell_q_mobile_C)
     try:
@@ -297,10 +295,10 @@ def _end(
             model=model,
             mismatch_V=settings.mismatch_V,
             nominal_Ah=settings.nominal_Ah,
-            samples=ahead.samples,
+            samples=samples,
         )
     except ValueError:
-        if ahead.is_asked:
+        if is_asked:
             raise
         return None
     load_A = part.load.mean_A if load is None else _largest_A(load, settings.cut_off_V)

@@ -17,7 +17,7 @@ from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import is_only_imprecise
 from battery_env.files import finite_or_none, replacing
-from battery_env.lab.calibrate import Ahead, calibrated
+from battery_env.lab.calibrate import calibrated
 from battery_env.lab.forecast import Forecast, decimals
 from battery_env.lab.life import Life, track_life
 from battery_env.lab.readers.columns import FileFormat
@@ -135,7 +135,7 @@ def forecast_end(
     settings = Settings() if settings is None else settings
     if life is not None:
         settings = replace(settings, prior_q_mobile_C=life.prior_for(discharge, load))
-    end = calibrated(discharge, settings, Ahead(load, samples, True)).end
+    end = calibrated(discharge, settings, load, samples, end_is_asked=True).end
     assert end is not None
     return end
 
@@ -228,7 +228,7 @@ def end_of_record(
         assert isinstance(calibrator, LeastSquares)
         past = track_life(before, settings.cut_off_V, calibrator)
         settings = replace(settings, prior_q_mobile_C=past.prior_for(running, to_come))
-    found = calibrated(running, settings, Ahead(to_come, is_asked=True))
+    found = calibrated(running, settings, to_come, end_is_asked=True)
     if not found.in_progress:
         raise ValueError(
             f"{argument} reaches {settings.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "

@@ -18,7 +18,7 @@ from battery_env.estimators.kalman.filter import PRIOR_SD_SHARE_Q, ExtendedKalma
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import Reason
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE
-from battery_env.policies.estimator import PolicyEstimator
+from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import CUT_OFF_V
 
 Method = Literal["least-squares", "kalman", "policy"]

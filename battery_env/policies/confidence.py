@@ -29,7 +29,7 @@ from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import ChargeHistory, Samples
 from battery_env.records.model import RecordModel
 from battery_env.tasks.voltage.fit import REACH_SD, Fitted
-from battery_env.tasks.voltage.task import ESTIMATE_RANGES, VoltageTask
+from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES, VoltageTask
 
 # Residuals below this may be what a linear step leaves, V
 _LINEAR_STEP_V = 2e-3

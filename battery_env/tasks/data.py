@@ -93,8 +93,8 @@ def _splits(
         whole = TrajectoryDataset.paper(parameters[0])
     else:
         ranges = PAPER_RANGES if load == "paper" else {"q_mobile": Q_MOBILE_RANGE_C, "r_o": R_O_RANGE_OHM}
-        asked = (parameters, DISCHARGES, _loads(load, dt_s), SEED, ranges["q_mobile"], ranges["r_o"])
-        whole = TrajectoryDataset.generate(*asked, dt_s, cell=cell, mismatch=mismatch)
+        q_C, r_ohm, loads = ranges["q_mobile"], ranges["r_o"], _loads(load, dt_s)
+        whole = TrajectoryDataset.generate(parameters, DISCHARGES, loads, SEED, q_C, r_ohm, dt_s, cell=cell, mismatch=mismatch)
         whole = whole.trimmed(*PAPER_TRIM) if load == "paper" else whole
     train, test = whole.split(test=TEST_SHARE, seed=SEED)
     return {"train": train, "test": test, "all": whole}

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.estimators.estimator import Record
-from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask
+from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask
 
 _ROW = np.zeros(1, dtype=np.intp)
 FloatSpace = gym.Space[NDArray[np.float32]]
@@ -60,8 +60,8 @@ def check_render_mode(render_mode: str | None) -> str | None:
 class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
     A calibration task for one cell. The reward is minus the cost, and ``info`` holds the cost and what
-    :meth:`~battery_env.tasks.task.CalibrationTask.report` says. ``help(env.task)`` describes what is observed, done,
-    paid and can be chosen.
+    :meth:`~battery_env.tasks.base.CalibrationTask.report` says. ``help(env.task)`` describes what is observed,
+    done, paid and can be chosen.
 
     :param task: the class of the task, or where it is, as ``"module:name"``
     :param render_mode: ``"rgb_array"`` or ``None``

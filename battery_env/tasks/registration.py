@@ -8,12 +8,12 @@ _PACKAGE = "battery_env.tasks"
 
 #: By id, the task that the environments for one cell and for many run; their pages are in docs/environments.
 TASKS: dict[str, str] = {
-    "BatteryQmax-v0": f"{_PACKAGE}.full_state.task:BatteryQmax",
-    "BatteryRo-v0": f"{_PACKAGE}.full_state.task:BatteryRo",
-    "BatteryJoint-v0": f"{_PACKAGE}.full_state.task:BatteryJoint",
-    "BatteryQmaxPaper-v0": f"{_PACKAGE}.full_state.task:BatteryQmaxPaper",
-    "BatteryRoPaper-v0": f"{_PACKAGE}.full_state.task:BatteryRoPaper",
-    "BatteryVoltageJoint-v0": f"{_PACKAGE}.voltage.task:VoltageTask",
+    "BatteryQmax-v0": f"{_PACKAGE}.full_state.full_state_task:BatteryQmax",
+    "BatteryRo-v0": f"{_PACKAGE}.full_state.full_state_task:BatteryRo",
+    "BatteryJoint-v0": f"{_PACKAGE}.full_state.full_state_task:BatteryJoint",
+    "BatteryQmaxPaper-v0": f"{_PACKAGE}.full_state.full_state_task:BatteryQmaxPaper",
+    "BatteryRoPaper-v0": f"{_PACKAGE}.full_state.full_state_task:BatteryRoPaper",
+    "BatteryVoltageJoint-v0": f"{_PACKAGE}.voltage.voltage_task:VoltageTask",
 }
 
 

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from battery_env.tasks.task import CalibrationTask
+from battery_env.tasks.base import CalibrationTask
 
 _LABELS = {"voltage": "voltage (V)", "q_mobile": "$q_{max}$ (C)", "r_o": "$R_o$ (ohm)"}
 

@@ -14,8 +14,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from battery_env.electrochemistry import FloatArray
+from battery_env.tasks.base import CalibrationTask
 from battery_env.tasks.env import CalibrationEnv, check_render_mode, new_task, spaces_of
-from battery_env.tasks.task import CalibrationTask
 
 Mask = NDArray[np.bool_]
 

@@ -22,7 +22,7 @@ from battery_env.records.discharge import load_nasa_discharges
 from battery_env.records.model import RecordModel
 from battery_env.records.samples import Stream
 from battery_env.sensors import SensorErrors
-from battery_env.tasks.voltage.task import ESTIMATE_RANGES, VoltageTask
+from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES, VoltageTask
 from tests.policies import Always
 from tests.sweeps import sweep
 

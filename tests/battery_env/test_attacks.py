@@ -23,10 +23,10 @@ from battery_env import NEW_CELL, Discharge, PolicyEstimator, Settings, fit_cell
 from battery_env.estimates import Estimate, last_estimate
 from battery_env.estimators import CellFit, ClosedForm, ExtendedKalmanFilter, LeastSquares, soc_from_rest
 from battery_env.estimators.estimator import OnlineEstimator
-from battery_env.lab.calibrate import Ahead, calibrated
+from battery_env.lab.calibrate import calibrated
 from battery_env.policies.pretrained import pretrained_ids
 from battery_env.records import Samples, Stream
-from battery_env.tasks.voltage.task import ESTIMATE_RANGES
+from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES
 from tests.sweeps import sweep
 
 WRONG_SHARE = 0.05
@@ -532,7 +532,7 @@ def test_nor_is_one_with_constants_that_were_fitted_to_the_wrong_discharges(fitt
             for share in (0.25, 0.5, 0.75, 1.0):
                 record = begun(discharge, share, cut_off_V) if share < 1.0 else discharge
                 try:
-                    found = calibrated(record, Settings.for_cell(fit, method=method), Ahead(samples=100))
+                    found = calibrated(record, Settings.for_cell(fit, method=method), samples=100)
                 except ValueError as error:  # takes more charge than a cell that was fitted when old ever holds
                     assert fitted == "old" and "beyond the upper bound" in str(error)
                     continue

@@ -12,8 +12,8 @@ import battery_env
 from battery_env.electrochemistry import NEW_CELL, QNB, STATE_NAMES, UNCERTAIN_CONSTANTS, VO, step, voltage
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.tasks.data import standard_dataset
+from battery_env.tasks.full_state.full_state_task import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.tasks.full_state.layout import ERROR_SCALE, OBSERVED, SCALED
-from battery_env.tasks.full_state.task import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.trajectories import TrajectoryDataset
 
 

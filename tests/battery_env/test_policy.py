@@ -9,7 +9,7 @@ from battery_env import NEW_CELL, CellParameters, PolicyEstimator, TrajectoryDat
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
 from battery_env.sensors import SensorErrors
-from battery_env.tasks.voltage.task import LARGEST_STEPS
+from battery_env.tasks.voltage.voltage_task import LARGEST_STEPS
 from tests.policies import Always
 
 

@@ -6,8 +6,8 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from battery_env.loads import RandomPiecewise
+from battery_env.tasks.base import CalibrationTask
 from battery_env.tasks.registration import TASKS
-from battery_env.tasks.task import CalibrationTask
 from battery_env.trajectories import TrajectoryDataset
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")

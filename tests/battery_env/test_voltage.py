@@ -10,9 +10,9 @@ from gymnasium.utils.env_checker import check_env
 from battery_env import NEW_CELL, Discharge, RandomSensorErrors, TrajectoryDataset, load_nasa_discharges
 from battery_env.loads import RandomPiecewise
 from battery_env.tasks.env import CalibrationEnv
-from battery_env.tasks.full_state.task import BatteryQmax
+from battery_env.tasks.full_state.full_state_task import BatteryQmax
 from battery_env.tasks.voltage.readings import Readings
-from battery_env.tasks.voltage.task import ESTIMATE_RANGES, LARGEST_STEPS, VoltageTask
+from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES, LARGEST_STEPS, VoltageTask
 
 BOTH = ("q_mobile", "r_o")
 LOW, HIGH = np.array([ESTIMATE_RANGES[name] for name in BOTH]).T

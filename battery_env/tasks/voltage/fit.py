@@ -177,8 +177,7 @@ class NuisanceFit:
         if self.prior.path is not None:  # its normal distribution is one of logarithms
             self._known.units[rows, : _R + 1] = now = estimate[rows]
             self._known.mean[rows, : _R + 1] = now * (1.0 + self.prior.mean[: _R + 1] - np.log(now))
-        read = rows, count, estimate, shown, self._model
-        nuisance_step(*read, self.constants, self._added, self._known, self._found)
+        nuisance_step(rows, count, estimate, shown, self._model, self.constants, self._added, self._known, self._found)
         if self.prior.path is not None:
             share = _LONGEST_STEP * estimate[rows, _Q] / np.maximum(np.abs(self._found[rows, _Q]), 1e-9)
             self._found[rows, : len(self.prior.mean)] *= np.minimum(share, 1.0)[:, None]

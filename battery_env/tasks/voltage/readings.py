@@ -52,7 +52,7 @@ MEASURED, CURRENT, MOVED, OHMIC, STEPS, HALF, VSN, VSP, FURTHER_VSN, FURTHER_VSP
 BLOCK_SIZE = 13 * BLOCK
 #: The first rows are what sensors show of a discharge: voltage, V, mean current since the reading before, A, charge that has
 #: left the surface of the negative electrode, C, ohmic drop per ohm, A, and steps of the model since the reading before.
-SHOWN = 5
+SENSOR_ROWS = 5
 # the most numbers that an instruction takes at once (AVX-512)
 _LANES = 8
 
@@ -160,7 +160,7 @@ class Readings:
         return slice(int(self.start[discharge]), int(self.start[discharge] + self.count[discharge]))
 
     def shown(self, discharge: int) -> FloatArray:
-        """What exact sensors show of one discharge, shape (SHOWN, readings)."""
+        """What exact sensors show of one discharge, shape (SENSOR_ROWS, readings)."""
         return self._all_shown[:, self.part(discharge)]
 
     @cached_property
@@ -288,7 +288,7 @@ AT_REST = Overpotentials(0.0, 0.0, 0.0, 0.0)
 
 @inlined
 def take_readings(block: FloatArray, shown: FloatArray, n: int, first: int, size: int) -> None:
-    for row in range(SHOWN):
+    for row in range(SENSOR_ROWS):
         for k in range(size):
             block[row * BLOCK + k] = shown[row, n, first + k]
 
@@ -298,7 +298,7 @@ def pad_block(block: FloatArray, size: int, moved_before: float) -> int:
     # Repeat the last reading up to the length that is returned, which vector instructions divide without a rest. The
     # overpotentials relax towards their value half way between two readings
     padded = (size + _LANES - 1) // _LANES * _LANES
-    for row in range(SHOWN):
+    for row in range(SENSOR_ROWS):
         for k in range(size, padded):
             block[row * BLOCK + k] = block[row * BLOCK + size - 1]
     block[HALF * BLOCK] = 0.5 * (moved_before + block[MOVED * BLOCK])
@@ -416,7 +416,7 @@ def explain(
     :param rows: which of the n cells
     :param count: how many readings of each cell there are, shape (n,)
     :param estimate: q_mobile and r_o, shape (n, 2)
-    :param shown: as of :meth:`Readings.shown`, shape (SHOWN, n, most readings)
+    :param shown: as of :meth:`Readings.shown`, shape (SENSOR_ROWS, n, most readings)
     :param means: overwritten: of the residual, dV/dq and the ohmic drop per ohm over the readings with less and with more
         current in equal stretches, shape (3, n, stretches, 2)
     :param rms_V: overwritten: root mean square of the residuals, shape (n,)

@@ -34,10 +34,10 @@ from battery_env.records import (
     history_of,
 )
 from battery_env.records.model import RecordModel
+from battery_env.tasks.base import CalibrationTask
 from battery_env.tasks.env import CalibrationEnv, task_class
-from battery_env.tasks.task import CalibrationTask
 from battery_env.tasks.voltage.fit import Fitted
-from battery_env.tasks.voltage.task import VoltageTask
+from battery_env.tasks.voltage.voltage_task import VoltageTask
 
 # Steps in which a stream is followed, s
 _STEP_S = 1.0

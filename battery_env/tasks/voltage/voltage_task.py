@@ -18,10 +18,10 @@ from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.parameters import PARAMETER_NAMES, check_parameters, columns_of
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
+from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
 from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
-from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
 from battery_env.tasks.voltage.fit import FitPrior, Fitted, NuisanceFit
-from battery_env.tasks.voltage.readings import CURRENT, MEASURED, OHMIC, SHOWN, Readings, explain
+from battery_env.tasks.voltage.readings import CURRENT, MEASURED, OHMIC, SENSOR_ROWS, Readings, explain
 from battery_env.trajectories import TrajectoryDataset
 
 #: Where estimates are kept, C and ohm.
@@ -201,7 +201,7 @@ class VoltageTask(CalibrationTask):
         self._last_step: IntArray = np.zeros(cells, dtype=np.int64)
         self._estimate = np.tile(self._new, (cells, 1))
         self._action = np.zeros((cells, len(self.parameters)))
-        self._shown = np.zeros((SHOWN, cells, longest))
+        self._shown = np.zeros((SENSOR_ROWS, cells, longest))
         # of the residual, V, of dV/dq_mobile, V/C, and of the ohmic drop per ohm, A
         self._means = np.zeros((3, cells, STRETCHES, 2))
         self._rms_V, self._last_V, self._offset_V, self._misfit_V = np.zeros((4, cells))
@@ -343,10 +343,10 @@ class VoltageTask(CalibrationTask):
     def _explain(self, rows: Rows | None = None) -> None:
         """Compare some cells with their readings, all by default."""
         of_cells = np.arange(self.cells) if rows is None else np.asarray(rows, dtype=np.int64)
-        read = (of_cells, self.count, self._estimate, self._shown)
-        explain(*read, self.readings.model, self._means, self._rms_V, self._last_V)
+        count, estimate, shown = self.count, self._estimate, self._shown
+        explain(of_cells, count, estimate, shown, self.readings.model, self._means, self._rms_V, self._last_V)
         if self._fit is not None:
-            self._fit.step(*read)
+            self._fit.step(of_cells, count, estimate, shown)
         residual_V = self._means[0]
         self._offset_V = np.clip(residual_V.mean(axis=(1, 2)), -self.sensors.offset_V, self.sensors.offset_V)
         self._misfit_V = np.sqrt(np.mean((residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))

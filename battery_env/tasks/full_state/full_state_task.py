@@ -17,8 +17,9 @@ from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import NEW_CELL, FloatArray, Trajectory
 from battery_env.electrochemistry.kernels import voltage_batch
 from battery_env.parameters import PARAMETER_NAMES
+from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
 from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
-from battery_env.tasks.full_state.kernels import decide, look_ahead, observe
+from battery_env.tasks.full_state.decisions import decide, look_ahead, observe
 from battery_env.tasks.full_state.layout import (
     CELL,
     CELL_WITH_CONSTANTS,
@@ -32,7 +33,6 @@ from battery_env.tasks.full_state.layout import (
     Formulation,
     Records,
 )
-from battery_env.tasks.task import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
 from battery_env.trajectories import TrajectoryDataset
 
 # A model that was wrong for a while has moved too much or too little charge from one electrode to the other. In both
