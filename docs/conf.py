@@ -8,13 +8,14 @@ from typing import Any
 import gymnasium as gym
 import jupytext
 from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx import addnodes
 from sphinx.application import Sphinx
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # the packages of this tree, also where others are installed
 
-from docs.environment_pages import CONTROL_IDS, IDS  # noqa: E402
+from docs.environment_pages import CONTROL_IDS, IDS, page_of  # noqa: E402
 
 project = "sb3_lac"
 author = "The sb3_lac contributors"
@@ -25,13 +26,12 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "sphinx_copybutton",
     "sphinx_design",
 ]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 templates_path = ["_templates"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "results"]  # raw tables are files of the repository
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["plates.css"]
@@ -43,12 +43,6 @@ autodoc_member_order = "bysource"
 autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntArray")}
 
 
-def entitle_table(app: Sphinx, docname: str, source: list[str]) -> None:
-    """The tables in results have no title of their own, and no place in the sidebar: the page of all tables leads to them."""
-    if docname.startswith("results/"):
-        source[0] = f"---\norphan: true\n---\n\n# {docname.removeprefix('results/')}\n\n{source[0]}"
-
-
 # the pages below a page in the sidebar
 BELOW = {
     "lac": ("how_lac_works", "stability_metrics", "published_lac"),
@@ -56,11 +50,13 @@ BELOW = {
     "cost_environments": tuple(f"environments/{env_id}" for env_id in CONTROL_IDS),
     "real_cells": ("tester_files", "own_cell", "forecasts", "streaming", "pretrained"),
     "parameters": ("identifiability",),
-    "battery_env": ("compare_calibrators", *(f"environments/{env_id}" for env_id in IDS if env_id not in CONTROL_IDS)),
+    "battery_env": (
+        "compare_calibrators",
+        *dict.fromkeys(f"environments/{page_of(each)}" for each in IDS if each not in CONTROL_IDS),
+    ),
     "results_at_a_glance": (
         *("reports/control_problems", "reports/certificates", "reports/designs", "reports/searches", "reports/speed"),
         *("reports/real_cells", "reports/voltage", "reports/wrong_constants", "reports/identifiability", "reports/full_state"),
-        "all_tables",
     ),
 }
 
@@ -69,6 +65,45 @@ def nest(app: Sphinx, docname: str, source: list[str]) -> None:
     """Hang pages below others, which a forge that shows the same files need not see."""
     if docname in BELOW:
         source[0] += "\n```{toctree}\n:hidden:\n\n" + "\n".join(f"/{name}" for name in BELOW[docname]) + "\n```\n"
+
+
+# where words lead that are searched for: each page says something of them
+SOUGHT = {
+    "battery_env": ("Gymnasium",),
+    "cell_life": ("capacity fade", "remaining useful life", "state of health, SOH"),
+    "cost_environments": ("disturbances",),
+    "faq": ("LFP", "NMC", "pack, packs"),
+    "forecasts": ("forecast", "end of discharge"),
+    "judge_any_loop": ("stability", "certificate", "Lyapunov function"),
+    "onnx": ("ONNX", "deployment"),
+    "own_problem": ("domain randomization",),
+    "parameters": ("capacity", "DCIR, HPPC", "EIS, impedance", "internal resistance"),
+    "real_cells": ("settled",),
+    "streaming": ("BMS", "Kalman filter"),
+    "tensorboard": ("wandb, Weights & Biases",),
+    "tester_files": ("Arbin, Maccor, Neware, BioLogic", "CSV, Excel, Parquet"),
+    "train_fast": ("GPU",),
+    "when_to_take_lac": ("SAC, TQC",),
+    "zoo": ("hyperparameters", "RL Zoo"),
+}
+
+
+def lead_search(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Let the search find first what a word leads to: its entry in the index, below the title."""
+    words = [word.strip() for entry in SOUGHT.get(docname, ()) for word in entry.split(",")]
+    if words:
+        title, newline, text = source[0].partition("\n")
+        entries = "".join(f"   single: ! {word}\n" for word in words)
+        source[0] = f"{title}{newline}\n```{{eval-rst}}\n.. index::\n{entries}```\n{text}"
+
+
+def draw_formula(translator: Any, node: nodes.math | nodes.math_block) -> None:
+    """A formula as MathML, which browsers draw by themselves, offline, too."""
+    text = tex2mathml(re.sub(r"frac(\d)(\d)", r"frac{\1}{\2}", node.astext()))
+    if isinstance(node, nodes.math_block):
+        text = f'<div class="math">{text.replace("<math", """<math display="block" """, 1)}</div>'
+    translator.body.append(text)
+    raise nodes.SkipNode
 
 
 # pages that can be downloaded as notebooks
@@ -96,10 +131,11 @@ def lead_to_site(app: Sphinx, doctree: nodes.document) -> None:
         target = link["reftarget"]
         if link["reftype"] != "myst" or target in app.env.found_docs:
             continue
+        file = f"{target}.md" if link["refdomain"] == "doc" else target
         found = next(
-            (path for folder in (page.parent, ROOT, ROOT / "docs") if (path := (folder / target).resolve()).exists()), None
+            (path for folder in (page.parent, ROOT, ROOT / "docs") if (path := (folder / file).resolve()).exists()), None
         )
-        outside = Path(target) if found is None else found
+        outside = Path(file) if found is None else found
         if (including := INCLUDING.get(outside.with_suffix(""))) is not None:
             link["reftarget"] = including
         elif found is not None and (name := app.env.path2doc(found)) in app.env.found_docs:
@@ -120,7 +156,8 @@ def refer_to_page(app: Sphinx, what: str, name: str, documented: Any, options: A
 
 
 def setup(app: Sphinx) -> None:
-    app.connect("source-read", entitle_table)
+    app.add_html_math_renderer("mathml", inline_renderers=(draw_formula, None), block_renderers=(draw_formula, None))
+    app.connect("source-read", lead_search)
     app.connect("source-read", offer_notebook)
     app.connect("source-read", nest)
     app.connect("doctree-read", lead_to_site)

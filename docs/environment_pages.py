@@ -28,7 +28,7 @@ from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.loads import constant
 from battery_env.tasks.data import standard_dataset
-from battery_env.tasks.env import CalibrationEnv
+from battery_env.tasks.env import CalibrationEnv, task_class
 from battery_env.tasks.full_state.full_state_task import FullStateTask
 from battery_env.tasks.registration import TASKS
 from battery_env.trajectories import TrajectoryDataset
@@ -44,6 +44,12 @@ IDS = [
 ]
 #: Those without a battery.
 CONTROL_IDS = [env_id for env_id in IDS if env_id not in TASKS]
+
+
+def page_of(env_id: str) -> str:
+    """The page of an environment; tasks with the full state share one."""
+    is_of_full_state = env_id in TASKS and issubclass(task_class(TASKS[env_id]), FullStateTask)
+    return "BatteryQmax-v0" if is_of_full_state else env_id
 
 
 def environment_page(env_id: str) -> str:
@@ -65,7 +71,7 @@ def ids() -> str:
         task = CalibrationEnv(TASKS[env_id], dataset=dataset).task
         rows.append(
             {
-                "id": f"[`{env_id}`](environments/{env_id}.md)",
+                "id": f"[`{env_id}`](environments/{page_of(env_id)}.md)",
                 "measured": "the full state" if isinstance(task, FullStateTask) else "current and voltage",
                 "to be found": " and ".join(f"`{name}`" for name in task.parameters),
                 "numbers in an observation": task.observation_size,
