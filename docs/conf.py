@@ -55,8 +55,8 @@ BELOW = {
         *dict.fromkeys(f"environments/{page_of(each)}" for each in IDS if each not in CONTROL_IDS),
     ),
     "results_at_a_glance": (
-        *("reports/control_problems", "reports/certificates", "reports/designs", "reports/searches", "reports/speed"),
-        *("reports/real_cells", "reports/voltage", "reports/wrong_constants", "reports/identifiability", "reports/full_state"),
+        *("reports/control_problems", "reports/certificates", "reports/designs", "reports/speed"),
+        *("reports/real_cells", "reports/voltage", "reports/wrong_constants", "reports/full_state"),
     ),
 }
 
