@@ -1,6 +1,6 @@
 """
 Write what the documentation takes from the code: the page of each environment without a battery, docs/environments/ID.md, from
-the docstring of its class, and in other pages the tables of environments, data sets, estimators and columns of the evaluation.
+the docstring of its class, and in other pages the tables of environments, data sets and estimators.
 
 .. code-block:: bash
 
@@ -24,7 +24,6 @@ from gymnasium.envs.registration import load_env_creator
 import battery_env.estimators
 import sb3_lac
 from battery_env.estimators import Estimator, OnlineEstimator
-from battery_env.evaluation import evaluate
 from battery_env.files import replacing
 from battery_env.loads import constant
 from battery_env.tasks.data import standard_dataset
@@ -88,11 +87,6 @@ def data_sets() -> str:
     return _markdown([dict(zip(table[0], row, strict=True)) for row in table[1:]])
 
 
-def columns() -> str:
-    """The columns of the evaluation."""
-    return _markdown([{"column": name, "meaning": meaning} for table in tables_of(evaluate) for name, meaning in table])
-
-
 def estimators() -> str:
     """All calibrators that need no learning in one table."""
     rows = []
@@ -116,7 +110,7 @@ def estimators() -> str:
 #: What is not written by hand, by page.
 PARTS: dict[str, dict[str, Callable[[], str]]] = {
     "battery_env": {"ids": ids, "data sets": data_sets},
-    "compare_calibrators": {"estimators": estimators, "columns": columns},
+    "compare_calibrators": {"estimators": estimators},
 }
 
 

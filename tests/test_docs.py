@@ -58,7 +58,7 @@ GUIDE = {
         "docs/battery_env",
     ],
     "results": ["docs/results_at_a_glance", "docs/paper_claims"],
-    "about": ["docs/files_and_faults", "docs/glossary", "docs/faq", "docs/citing"],
+    "about": ["docs/files_and_faults", "docs/glossary", "docs/faq"],
 }
 STYLED = [name for names in GUIDE.values() for name in names]
 REPORTS = sorted((DOCS / "reports").glob("*.md"))

@@ -92,18 +92,18 @@ def test_common_options_are_options_of_all(dataset):
                 assert "dataset stands in place of" in str(error), (env_id, name)
 
 
-def test_columns_in_the_page_are_those_of_the_evaluation(dataset):
-    scores = evaluate(ClosedForm(), dataset[:1])
-    names = [name.strip(",. ") for name in first_cells("compare_calibrators", "Evaluation")]
+def test_columns_of_the_evaluation_are_those_that_its_docstring_names(dataset):
+    cells = [cell for table in environment_pages.tables_of(evaluate) for cell, _ in table]
+    names = {name for cell in cells for name in re.findall(r"`+(.*?)`+", cell)}
     shown = {name.replace("p_", f"{p}_", 1) if name.startswith("p_") else name for name in names for p in ("q_mobile", "r_o")}
     shown |= {p if name == "p" else name for name in names for p in ("q_mobile", "r_o")}
     shown |= {name.replace("25", share) for name in names for share in ("50", "75") if "at_25" in name}
-    assert set(scores.columns) - {"trajectory"} <= shown
+    assert set(evaluate(ClosedForm(), dataset[:1]).columns) - {"trajectory"} <= shown
 
 
-def test_all_plots_are_listed():
-    functions = {name for name in vars(plotting) if name.startswith("plot_")}
-    assert set(first_cells("compare_calibrators", "Plots")) == functions
+def test_all_plots_are_in_the_reference():
+    listed = re.findall(r"battery_env\.plotting\.(plot_\w+)", (environment_pages.DOCS / "api.md").read_text(encoding="utf-8"))
+    assert {name for name in vars(plotting) if name.startswith("plot_")} == set(listed)
 
 
 def test_only_what_stands_between_markers_is_written(tmp_path, capsys):
