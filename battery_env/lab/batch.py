@@ -405,7 +405,7 @@ class Results:
         return path
 
     def write_tables(self) -> list[Path]:
-        """Write the table of all rows of the run and, if several are whole, the figure of their parameters over them."""
+        """The table of all rows, written, if several are whole the figure of their parameters, and the first of the voltages."""
         table = pd.DataFrame(self._sorted_rows()).astype(_TYPES)
         written = [self.write(f"{self._prefix}{TABLES[0]}", partial(table.to_csv, index=False))]
         more: dict[str, Callable[[Path], Any]] = {}
@@ -420,7 +420,7 @@ class Results:
             except Exception as error:  # whatever it is, the numbers are written
                 path = self.folder / f"{self._prefix}{name}"
                 warnings.warn(f"{path} is not written: {type(error).__name__}: {error}", stacklevel=2)
-        return written
+        return [*written, *sorted(self.folder / name for name in self._files if name.endswith(f"{VOLTAGE}.png"))[:1]]
 
     @property
     def has_numbers(self) -> bool:

@@ -73,6 +73,7 @@ class End:
             "record": self.name,
             "method": self.calibration.method,
             "settled": self.calibration.settled,
+            "reason": self.calibration.reason,
             "load": found.load_name,
             "cut_off_V": found.cut_off_V,
             "now_s": found.now_s,
