@@ -405,7 +405,7 @@ class Results:
         return path
 
     def write_tables(self) -> list[Path]:
-        """The table of all rows, written, if several are whole the figure of their parameters, and the first of the voltages."""
+        """Write the table of all rows and, if several are whole, a figure of them; one of voltages is named, too."""
         table = pd.DataFrame(self._sorted_rows()).astype(_TYPES)
         written = [self.write(f"{self._prefix}{TABLES[0]}", partial(table.to_csv, index=False))]
         more: dict[str, Callable[[Path], Any]] = {}

@@ -119,10 +119,7 @@ def read_discharges(
 
 
 def each_usable(use: Callable[[Discharge], Made], readers: Mapping[str, Callable[[], list[Recording]]]) -> list[Made]:
-    """
-    What is made of each discharge, by sources and what reads each. What cannot be used is left out with a warning; if nothing
-    can, that is an error.
-    """
+    """What is made of each discharge, by sources and what reads each; a warning tells what is left out, if not all is."""
     made, errors = [], []
     for name, read in readers.items():
         try:
