@@ -26,7 +26,7 @@ PICTURES = Path(__file__).parent / "pictures"
 _SEED = 3
 _SIZE = (320, 240)
 #: Of the drawings: few, so that files are small.
-_COLOURS = ("black", "0.2", "0.6", "0.8", "tab:green", "tab:orange", "tab:blue")
+_COLOURS = ("black", "0.2", "0.6", "0.8", "tab:green", "tab:orange", "tab:blue", "#0072b2", "#d55e00")
 
 
 class Episode(NamedTuple):
