@@ -70,7 +70,9 @@ def curves(errors_m: dict[str, list[float]], steps: int) -> Image.Image:
     picture = Image.new("RGB", (2 * _WIDTH, _CURVES_HEIGHT), "white")
     pen = ImageDraw.Draw(picture)
     left, bottom, scale_x, scale_y = 12, _CURVES_HEIGHT - 8, (2 * _WIDTH - 90) / STEPS, (_CURVES_HEIGHT - 34) / _LARGEST_M
-    pen.text((left, 2), f"distance from the middle of the road, 0 to {_LARGEST_M:g} m, over {STEPS * 0.05:g} s", "black", _FONT)
+    pen.text(
+        (left, 2), f"distance from the middle of the road, 0 to {_LARGEST_M:g} m, over {STEPS * 0.05:g} s", "black", _FONT
+    )
     pen.line((left, bottom, left + STEPS * scale_x, bottom), "black", 1)
     for name, values in errors_m.items():
         colour = COLOUR_OF[name]

@@ -254,7 +254,7 @@ MOST = {
     ("lines", "battery_env"): 19_093,
     ("lines", "sb3_lac"): 6_931,
     ("lines", "benchmarks"): 6_469,
-    ("lines", "tests"): 18_326,
+    ("lines", "tests"): 18_300,
     ("numbers at the top of modules", "battery_env"): 206,
     ("numbers at the top of modules", "sb3_lac"): 20,
     ("starred calls", "battery_env"): 68,
