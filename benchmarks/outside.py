@@ -151,11 +151,12 @@ def comparison(rows: pd.DataFrame) -> pd.DataFrame:
 
 def report(rows: pd.DataFrame, compared: pd.DataFrame) -> str:
     """Two tables, as Markdown."""
+    shown = {name: label for name, (label, _) in ALGORITHMS.items() if name in set(rows["algorithm"])}
     returns = [
-        {"task": task, "steps": str(of_task["timesteps"].max()), "seeds": _seeds(of_task)}
+        {"task": task, "steps": str(of_task["timesteps"].max()), "seeds": str(of_task["seed"].nunique())}
         | {
             label: with_interval(own[RETURN]) if len(own := of_task[of_task["algorithm"] == name]) else ""
-            for name, (label, _) in ALGORITHMS.items()
+            for name, label in shown.items()
         }
         for task, of_task in rows.groupby("task", sort=False)
     ]
@@ -174,11 +175,6 @@ def report(rows: pd.DataFrame, compared: pd.DataFrame) -> str:
         text += "\nLAC by its defaults against each other one, with 95 % intervals; above 0, and above 0.5, LAC is ahead:\n\n"
         text += markdown(cells)
     return text
-
-
-def _seeds(of_task: pd.DataFrame) -> str:
-    counts = of_task.groupby("algorithm")["seed"].nunique()
-    return str(counts.min()) if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"
 
 
 def _with_bounds(row: Mapping[Any, Any], name: str) -> str:

@@ -307,9 +307,10 @@ def make_rows(
     describe: Callable[[OffPolicyAlgorithm, Run], Mapping[str, float]] | None = None,
 ) -> pd.DataFrame:
     """
-    Make the rows of ``<out>/runs.csv`` that are missing, in their order, and return those that are there then.
+    Make the rows of ``<out>/runs.csv`` that are missing, in their order, and return those of each task and algorithm that then
+    has all of its seeds: fewer would make a table of another kind.
 
-    :raises SystemExit: if there is none yet
+    :raises SystemExit: if none has them yet
     """
     chosen = study.chosen
     for name in ("minutes", "checkpoints", "merge"):
@@ -323,6 +324,7 @@ def make_rows(
         trainer = Trainer(rows.file, chosen.checkpoints, importable(judge), describe, deadline, chosen.compile)
         study.each(trainer, [(run,) for run in runs if not rows.has(run)])
     done = rows.of(runs)
-    if done.empty:
-        raise SystemExit("No training is done yet: the same command goes on from the checkpoints.")
-    return done
+    whole = done[done.groupby(["task", "algorithm"])["seed"].transform("nunique") == len(set(chosen.seeds))]
+    if whole.empty:
+        raise SystemExit("No algorithm has all of its seeds on a task yet: the same command goes on from the checkpoints.")
+    return whole
