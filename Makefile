@@ -65,7 +65,7 @@ type-check: install  ## mypy
 	$(BIN)/python -m mypy
 
 docs: install  ## the documentation site, in docs/_build/html
-	rm -rf docs/_api  # pages of names that are gone would stay
+	rm -rf docs/_api docs/_build/html  # pages of names that are gone would stay, and the search lose entries
 	$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build/html
 
 commit-checks: lint type-check docs test test-attacks  ## everything that must pass before a commit

@@ -93,7 +93,7 @@ def lead_search(app: Sphinx, docname: str, source: list[str]) -> None:
     words = [word.strip() for entry in SOUGHT.get(docname, ()) for word in entry.split(",")]
     if words:
         title, newline, text = source[0].partition("\n")
-        entries = "".join(f"   single: ! {word}\n" for word in words)
+        entries = "".join(f"   ! single: {word}\n" for word in words)
         source[0] = f"{title}{newline}\n```{{eval-rst}}\n.. index::\n{entries}```\n{text}"
 
 
@@ -139,7 +139,7 @@ def lead_to_site(app: Sphinx, doctree: nodes.document) -> None:
         if (including := INCLUDING.get(outside.with_suffix(""))) is not None:
             link["reftarget"] = including
         elif found is not None and (name := app.env.path2doc(found)) in app.env.found_docs:
-            link["reftarget"] = name
+            link.attributes |= {"refdomain": "doc", "reftarget": name, "reftargetid": None}  # and no name of the API
         elif found is not None and found.is_file():
             name = str(app.env.dlfiles.add_file(app.env.docname, str(found)))
             link.replace_self(addnodes.download_reference("", "", *link.children, filename=name, reftarget=str(found)))
