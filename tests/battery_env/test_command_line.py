@@ -24,6 +24,7 @@ from battery_env.lab.command_line import main
 from battery_env.lab.settings import SettingsOptions
 from battery_env.lab.sources import find_sources
 from battery_env.loads import constant
+from tests.sweeps import sweep
 
 
 @pytest.fixture(scope="module")
@@ -449,7 +450,7 @@ def one_after_the_other(fleet):
     return fleet()
 
 
-@pytest.mark.parametrize("where", ["processes", "cluster"])
+@pytest.mark.parametrize("where", sweep("processes", "cluster"))
 def test_a_fleet_side_by_side_is_the_same_as_one_after_the_other(where, fleet, one_after_the_other, request):
     chosen = ["--jobs", "2"]
     if where == "cluster":

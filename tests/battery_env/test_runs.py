@@ -5,6 +5,7 @@ import gzip
 import json
 import lzma
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from battery_env.lab.command_line import main
 from battery_env.lab.readers import tables
 from battery_env.lab.sources import find_sources
 from tests.faults import a_full_disk, squared_unless_it_ends_its_process
+from tests.sweeps import sweep
 
 ROWS = 8
 
@@ -88,7 +90,7 @@ def undisturbed(lab, tmp_path_factory):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="it looks for processes as Linux has them")
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, "worker"])
+@pytest.mark.parametrize("end", sweep(signal.SIGTERM, signal.SIGKILL, "worker"))
 def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed, tmp_path, capsys):
     arguments = (lab, "--out", tmp_path, "--table-only", "--jobs", 2)
     process = started(*arguments)
@@ -138,15 +140,23 @@ def quick(said, monkeypatch):
     monkeypatch.setattr("battery_env.plotting.plot_cell_fit", lambda *given: Figure((1.0, 1.0)))
 
 
-@pytest.fixture
-def pair(tmp_path, monkeypatch):
-    """Two folders of records, of the same names, and where all results go."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def written_pair(tmp_path_factory):
+    """Two folders of records, of the same names, and one in progress beside them."""
+    whole = tmp_path_factory.mktemp("pair")
     for folder, cell in (("lab", "B0005"), ("other", "B0006")):
-        Path(folder).mkdir()
+        (whole / folder).mkdir()
         for number, record in enumerate(load_nasa_discharges(cell)[:2]):
-            write(record, Path(folder, f"c{number}.csv"))
-    write(load_nasa_discharges("B0006")[9].until(1500.0), Path("c1.csv"))
+            write(record, whole / folder / f"c{number}.csv")
+    write(load_nasa_discharges("B0006")[9].until(1500.0), whole / "c1.csv")
+    return whole
+
+
+@pytest.fixture
+def pair(written_pair, tmp_path, monkeypatch):
+    """The same for one test, and where all results go."""
+    shutil.copytree(written_pair, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
@@ -169,7 +179,7 @@ def contents(out):
 
 
 @pytest.mark.parametrize("ends", ["whole", "before its tables"])
-@pytest.mark.parametrize("first", COMMANDS)
+@pytest.mark.parametrize("first", sweep(*COMMANDS))
 def test_no_command_touches_what_another_one_wrote_to_the_same_folder(first, ends, quick, pair, capsys, monkeypatch):
     if ends != "whole" and not COMMANDS[first].startswith("calibrate lab "):
         pytest.skip("others end whole or not at all")
@@ -229,10 +239,10 @@ def test_rows_of_files_that_are_not_there_are_kept(left, quick, pair, capsys):
     assert set(pd.read_csv("out/estimate.csv")["record"]) == {"c0", "c1", "c5"}
 
 
-STRANGERS = [b"", b"Dear all", b"{}", b"[]\n", bytes(100), b"\xff\n", b'{"format": "another"}\n{"row": 1}\n']
+STRANGERS = [b"Dear all", b"", b"{}", b"[]\n", bytes(100), b"\xff\n", b'{"format": "another"}\n{"row": 1}\n']
 
 
-@pytest.mark.parametrize("content", STRANGERS)
+@pytest.mark.parametrize("content", sweep(*STRANGERS))
 def test_a_file_of_somebody_else_is_left_alone(content, quick, pair, capsys):
     (pair / "out").mkdir()
     run = pair / "out" / "estimate.jsonl"
@@ -256,7 +266,7 @@ def test_one_command_at_a_time_writes_to_a_folder(quick, pair, capsys):
     assert not contents(pair / "out") and main("calibrate lab/c1.csv --out out".split()) == 0
 
 
-@pytest.mark.parametrize("left", [b"", b'{"source": "', bytes(100), b"\xff\n", b"[]\n", b'{"source": 3}\n'])
+@pytest.mark.parametrize("left", sweep(b'{"source": "', b"", bytes(100), b"\xff\n", b"[]\n", b'{"source": 3}\n'))
 def test_what_a_power_cut_left_of_a_run_is_gone_on_from(left, quick, pair, monkeypatch):
     arguments = "calibrate lab/c0.csv lab/c1.csv --out out --table-only".split()
     assert main(arguments) == 0

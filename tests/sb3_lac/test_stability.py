@@ -173,7 +173,7 @@ def test_ends_of_episodes(make_exact_model):
 @pytest.mark.parametrize("n", [2, 71, 72])
 def test_interval_of_a_percentile_covers_it(n):
     rng = np.random.default_rng(0)
-    intervals = np.array([exact_percentile(rng.exponential(size=n), 95) for _ in range(1000)])
+    intervals = np.array([exact_percentile(rng.exponential(size=n), 95) for _ in range(300)])
     covers = (intervals[:, 1] <= np.log(20)) & (np.log(20) <= intervals[:, 2])
     assert covers.mean() > 0.94
     assert np.isinf(intervals[:, 2]).all() == (n < 72)
@@ -455,22 +455,18 @@ def test_callbacks_of_stable_baselines3_stop_a_training_after_an_evaluation(make
 # The functions are fitted on few episodes
 @pytest.mark.filterwarnings("ignore:Observations lie far")
 @pytest.mark.parametrize("algorithm", [LAC, SAC])
-@pytest.mark.parametrize("normalize", [False, True])
-def test_training_with_callback_is_the_same_to_the_bit(make_env, algorithm, normalize):
+def test_training_with_callback_is_the_same_to_the_bit(make_env, algorithm):
     def train(callback):
-        env = make_vec_env(make_env, n_envs=2, seed=0)
-        env = VecNormalize(env, gamma=0.99) if normalize else env
+        env = VecNormalize(make_vec_env(make_env, n_envs=2, seed=0), gamma=0.99)
         options = {"learning_starts": 20, "batch_size": 16, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}}
         return algorithm("MlpPolicy", env, **options, seed=0, device="cpu").learn(84, callback=callback)
 
-    env = make_vec_env(make_env, n_envs=3)
-    env = VecNormalize(env) if normalize else env
+    env = VecNormalize(make_vec_env(make_env, n_envs=3))
     make = LyapunovCallback if algorithm is LAC else CertificateCallback
     callback = make(env, n_eval_episodes=4, eval_freq=7, verbose=0)
     model, alone = train(callback), train(None)
     assert len(callback.history) == 84 // 14
     for name, tensor in model.policy.state_dict().items():
         assert th.equal(tensor, alone.policy.state_dict()[name]), name
-    if normalize:
-        np.testing.assert_array_equal(env.obs_rms.mean, model.get_vec_normalize_env().obs_rms.mean)
-        assert env.ret_rms.var == model.get_vec_normalize_env().ret_rms.var != 1
+    np.testing.assert_array_equal(env.obs_rms.mean, model.get_vec_normalize_env().obs_rms.mean)
+    assert env.ret_rms.var == model.get_vec_normalize_env().ret_rms.var != 1
