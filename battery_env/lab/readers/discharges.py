@@ -135,8 +135,8 @@ def each_usable(use: Callable[[Discharge], Made], readers: Mapping[str, Callable
                 errors.append(ValueError(f"{name}: {number}{error}"))
     if not made:
         raise errors[0]
-    for error in errors:
-        warnings.warn(f"{error} It is left out.", stacklevel=3)
+    for reason in errors:
+        warnings.warn(f"{reason} It is left out.", stacklevel=3)
     return made
 
 
