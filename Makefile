@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 SOURCES := sb3_lac battery_env benchmarks tests examples docs
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-attacks test-oldest format lint type-check docs commit-checks clean
+.PHONY: help install demo test test-attacks test-browser test-oldest format lint type-check docs commit-checks clean
 
 help:  ## list the commands
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -44,6 +44,10 @@ test: install  ## all tests but attacks
 
 test-attacks: install  ## attacks: sweeps over faults of records, their sizes and their places
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m attacks
+
+test-browser: install  ## the page for the bench in Chromium, which must be there; PICTURES=FOLDER keeps what is seen
+	@$(call logged,$(BIN)/python -m pip install --editable ".[browser]")
+	$(BIN)/python -m pytest -m browser
 
 test-oldest:  ## those of both packages, with the oldest versions that setup.cfg names of all but torch
 	$(PYTHON) -m venv --clear $(VENV)/oldest

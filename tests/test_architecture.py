@@ -216,7 +216,7 @@ def declared(distributions, extras):
         ("battery_env", ("battery_env",), ("cluster", "cyclers", "excel", "onnx", "page", "parquet", "sb3")),
         ("sb3_lac", (".",), ("zoo", "onnx")),
         ("benchmarks", ("battery_env", "."), ("zoo", "peers", "pybop")),
-        ("tests", ("battery_env", "."), ("zoo", "peers", "onnx", "dev")),
+        ("tests", ("battery_env", "."), ("zoo", "peers", "onnx", "browser", "dev")),
     ],
 )
 def test_every_import_is_declared(package, distributions, extras):

@@ -10,7 +10,6 @@ import io
 import json
 import os
 import re
-import subprocess
 import sys
 import warnings
 from collections import Counter
@@ -19,19 +18,18 @@ from contextlib import contextmanager
 from dataclasses import fields
 from difflib import get_close_matches
 from functools import wraps
-from importlib.resources import files
 from importlib.util import find_spec
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Literal, ParamSpec
 
 from battery_env.compiled import saying_that_it_compiles
-from battery_env.estimators.cell_fit import CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.estimators.joint_fit import fit_cell
 from battery_env.estimators.search import spread_over
 from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.lab.batch import VERSION, Outcome, Results, calibrate_all, interruptible, workers
+from battery_env.lab.page_server import serve
 from battery_env.lab.readers.columns import FileFormat, description, recognise
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.readers.testers import find_tester, tester_file
@@ -454,17 +452,8 @@ def _settings(options: argparse.Namespace) -> Settings:
     given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in vars(options).items() if name in names
     }
-    path: Path | None = vars(options).get("cell")
-    if path is None:
-        return Settings(**given)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no file {str(path)!r} for --cell: give what the command fit, CellParameters.to_json or AgingPath.to_json wrote"
-        )
-    cell = read_cell(path)
-    if isinstance(cell, CellFit) and cell.doubt:
-        print(f"warning: {path}: {cell.doubt}", file=sys.stderr)
-    return Settings.for_cell(cell, **given)
+    with _saying():
+        return Settings.for_file(vars(options).get("cell"), **given)
 
 
 @_ending
@@ -522,16 +511,15 @@ def page(arguments: Sequence[str] | None = None, name: str = "python -m battery_
     parser = argparse.ArgumentParser(
         prog=name,
         description="Open a page in the browser: drop files, see q_max, R_o, health and the life, forecast the end.",
-        epilog="Needs the extra page: pip install 'battery_env[page]'. Nothing is stored, and nothing leaves this machine.",
+        epilog="Needs the extra page: pip install 'battery_env[page]'. Nothing leaves this machine, or stays on its disk.",
         allow_abbrev=False,
     )
-    parser.add_argument("--port", type=int, default=8501, metavar="N", help="of the page (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=8501, metavar="N", help="of the page, or the next free one (%(default)s)")
     options = parser.parse_args(arguments)
     if find_spec("streamlit") is None or find_spec("plotly") is None:
         raise ImportError("the page needs Streamlit and Plotly: pip install 'battery_env[page]'")
-    script = str(files("battery_env") / "lab" / "page.py")
-    local = ["--server.address", "localhost", "--server.port", str(options.port), "--browser.gatherUsageStats", "false"]
-    return subprocess.run([sys.executable, "-m", "streamlit", "run", script, *local], check=False).returncode
+    serve(Path(__file__).with_name("page.py"), options.port)
+    return SETTLED
 
 
 @_ending

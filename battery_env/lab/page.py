@@ -1,5 +1,6 @@
 """The page for the bench, ``battery-calibrate page``: files in, q_max, R_o, health, life and the end of a discharge out."""
 
+import os
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -9,19 +10,35 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 import streamlit as st
+from plotly.colors import qualitative
 
-from battery_env.lab.batch import FileFormat, attempt
+from battery_env.lab.batch import attempt
 from battery_env.lab.calibrate import calibrate
-from battery_env.lab.life import Life, track_life
+from battery_env.lab.life import Life
+from battery_env.lab.readers.columns import FileFormat, description, recognise
+from battery_env.lab.readers.discharges import Recording
+from battery_env.lab.readers.tables import open_file
 from battery_env.lab.report import Calibration
-from battery_env.lab.running import forecast_end
+from battery_env.lab.running import forecast_end, life_before
 from battery_env.lab.settings import Settings
-from battery_env.lab.sources import find_sources, no_formula, read_source, record_name
+from battery_env.lab.sources import Source, find_sources, no_formula, read_source, record_name
 from battery_env.loads import constant
-from battery_env.plotting import COLOURS
 from battery_env.records.discharge import Discharge
 
 LAYOUT = {"height": 330, "margin": {"t": 30, "b": 30}, "legend": {"orientation": "h", "y": -0.25}, "showlegend": True}
+# The columns that are read most, by label.
+SHORT = {
+    "q_max (Ah)": "q_mobile_C",
+    "sd (Ah)": "sd_q_mobile_C",
+    "R_o (mohm)": "r_o_ohm",
+    "sd (mohm)": "sd_r_o_ohm",
+    "state of health": "state_of_health",
+}
+# What can be stated of files: where a quantity stands and in which unit, the sign of a discharge, the charge at its start.
+UNITS = {"time": ("s", "ms", "min", "h"), "voltage": ("V", "mV"), "current": ("A", "mA"), "temperature": ("degC", "K")}
+TOLD = "told from the voltage"
+SIGNS = {TOLD: None, "negative": True, "positive": False}
+FULL, RESTED, KNOWN = "with a full cell", "at rest: the voltage tells the charge", "with a known charge"
 
 
 class Found(NamedTuple):
@@ -33,35 +50,123 @@ class Found(NamedTuple):
     says: Calibration
 
 
-def looked_at(name: str, cell: str, recording: Any, settings: Settings) -> Found:
+def ask() -> tuple[list[Any], str, bool, FileFormat, dict[str, Any]]:
+    """The fields at the left, and what the form of :func:`ask_how_to_read` says."""
+    side, state = st.sidebar, st.session_state
+    files: Any = side.file_uploader(
+        "Drop the files of your tester, and my_cell.json if you have one", accept_multiple_files=True
+    )
+    # what its owner may read is only for whoever knows the address of the page, which has a secret
+    place = "or name a folder of this machine, or a bundled cell: B0005"
+    folder = side.text_input(place) if st.get_option("server.baseUrlPath") else ""
+    is_one_cell = side.checkbox("all files are of one cell, the oldest first")
+    cut_off_V = side.number_input("cut-off (V)", 0.5, value=None, placeholder="2.7, or that of my_cell.json", step=0.1)
+    nominal_Ah = side.number_input("nominal capacity (Ah)", 0.001, value=None, placeholder="not known", step=0.1)
+    start = side.selectbox("each discharge starts", (FULL, RESTED, KNOWN))
+    soc = side.number_input("charge at the start (%)", 20.0, 100.0, 80.0, 5.0) / 100.0 if start == KNOWN else None
+    side.caption("Computed on this machine. Its disk holds files only while they are read, its memory until the command ends.")
+    columns = {each: name for each in UNITS if (name := state.get(f"column of {each}"))}
+    units = {each: unit for each in UNITS if (unit := state.get(f"unit of {each}"))}
+    stated = {"cut_off_V": cut_off_V, "nominal_Ah": nominal_Ah, "initial_soc": "rest" if start == RESTED else soc}
+    stated = {name: value for name, value in stated.items() if value is not None}
+    return files, folder, is_one_cell, FileFormat(columns, units, SIGNS[state.get("sign", TOLD)]), stated
+
+
+def ask_how_to_read(file: str, columns: list[str], recognised: str, is_wrong: bool) -> None:
+    """A form for what files do not tell of themselves, with what is recognised of one of them."""
+    with st.expander(f"Is a file read wrongly? This is recognised of {file}", is_wrong), st.form("reading", border=False):
+        st.code(recognised, None)
+        for place, (quantity, units) in zip(st.columns(len(UNITS)), UNITS.items(), strict=True):
+            own: dict[str, Any] = {"index": None, "accept_new_options": True}
+            place.selectbox(f"{quantity}: column", columns, key=f"column of {quantity}", placeholder="as found", **own)
+            place.selectbox("unit", units, key=f"unit of {quantity}", placeholder="as its name says", **own)
+        st.selectbox("the current of a discharge is", list(SIGNS), key="sign")
+        st.form_submit_button("Read again")
+        st.caption(
+            "This holds for all files. Of what messages name `--columns`, `--units` and `--discharge-is-negative` "
+            "stand here, `--cut-off`, `--nominal` and `--initial-soc` at the left; `--cell` is my_cell.json."
+        )
+
+
+def recognised_of(path: Path, file_format: FileFormat) -> tuple[str, list[str], str]:
+    """Name and columns of a file, and what is recognised of them."""
+    opened = open_file(path, file_format)
+    found = recognise(opened.names, FileFormat(), opened.rows)
+    return path.name, list(dict.fromkeys(filter(None, opened.names))), description(opened.names, opened.rows, found)
+
+
+def read(paths: list[str], file_format: FileFormat, troubles: list[str]) -> list[tuple[Source, Recording]]:
+    """What files hold. What is recognised of the first of them that cannot be read, or of the first, is kept beside."""
+    recordings: list[tuple[Source, Recording]] = []
+    unread: list[Source] = []
+    sources, notes, error = attempt(find_sources, paths)
+    troubles += [*notes, error]
+    for source in sources or ():
+        found, notes, error = attempt(read_source, source, file_format)
+        name = Path(source.path).name
+        troubles += [f"**{name}**: {each}".replace(f"{source.path}: ", "") for each in (*notes, error) if each]
+        recordings += [(source, each) for each in found or ()]
+        unread += [source] if error else []
+    for source in (*unread, *(sources or ()))[:1]:
+        table, *_ = attempt(recognised_of, Path(source.path), file_format)
+        st.session_state.table = (*table, bool(unread)) if table else None
+    return recordings
+
+
+def answer(files: list[Any], folder: str, is_one_cell: bool, file_format: FileFormat, stated: dict[str, Any]) -> None:
+    """What all discharges say, while a bar shows how far it is; what cannot be used is named with its reason."""
+    state, bar = st.session_state, st.progress(0.0, "reading the files")
+    state.found, state.lives, state.table = [], {}, None
+    names = [Path(each.name).name for each in files]
+    troubles = [f"**{each}**: only one of this name is used" for each in {*names} if names.count(each) > 1]
+    with tempfile.TemporaryDirectory() as given:
+        for name, each in zip(names, files, strict=True):
+            Path(given, name).write_bytes(each.getvalue())
+        dropped = [Path(given, name) for name in dict.fromkeys(names)]
+        cells = [path for path in dropped if path.suffix == ".json"]
+        state.settings, notes, error = attempt(settings_of, cells, stated)
+        troubles += [*notes, error]
+        paths = [str(each) for each in dropped if each not in cells] + [folder] * bool(folder)
+        recordings = read(paths, file_format, troubles) if state.settings else []
+    for number, (source, recording) in enumerate(recordings):
+        name = record_name(source.stem, recording.meta.get("cycle"))
+        bar.progress(number / len(recordings), f"{name}, {number + 1} of {len(recordings)}; the very first one takes longer")
+        cell = no_formula(str(recording.meta.get("cell", "cell" if is_one_cell else source.cell)))
+        seen, notes, error = attempt(looked_at, name, cell, recording, state.settings)
+        troubles += [f"**{name}**: {each}" for each in (*notes, error) if each]
+        state.found += [seen] if seen else []
+    bar.empty()
+    state.troubles = [each.replace(f"{given}{os.sep}", "") for each in dict.fromkeys(troubles) if each]
+
+
+def settings_of(cells: list[Path], stated: dict[str, Any]) -> Settings:
+    """How discharges are looked at, with the constants of a cell if there is a file of them."""
+    if len(cells) > 1:
+        raise ValueError(f"{' and '.join(each.name for each in cells)} are constants of cells: drop those of one")
+    return Settings.for_file(cells[0] if cells else None, **stated)
+
+
+def looked_at(name: str, cell: str, recording: Recording, settings: Settings) -> Found:
     """What a discharge says."""
     return Found(name, cell, discharge := recording.discharge(), calibrate(discharge, settings))
 
 
-def calibrated(paths: list[str], settings: Settings, one_cell: bool, troubles: list[str]) -> list[Found]:
-    """What all discharges say, while a bar shows how far it is; what cannot be used is named with its reason."""
-    bar, recordings, found = st.progress(0.0, "reading the files"), [], []
-    sources, notes, _ = attempt(find_sources, paths)
-    troubles += notes
-    for source in sources:
-        (read, notes, error), name = attempt(read_source, source, FileFormat()), Path(source.path).name
-        troubles += [f"**{name}**: {each}".replace(f"{source.path}: ", "") for each in (*notes, error) if each]
-        recordings += [(source, each) for each in read or ()]
-    for number, (source, recording) in enumerate(recordings):
-        name = record_name(source.stem, recording.meta.get("cycle"))
-        bar.progress(number / len(recordings), f"{name}, {number + 1} of {len(recordings)}; the very first one takes longer")
-        cell = no_formula(str(recording.meta.get("cell", "cell" if one_cell else source.cell)))
-        seen, notes, error = attempt(looked_at, name, cell, recording, settings)
-        troubles += [f"**{name}**: {each}" for each in (*notes, error) if each]
-        found += [seen] if seen else []
-    bar.empty()
-    return found
+def show_numbers(says: Calibration) -> None:
+    """The numbers of a discharge, each with its standard deviation."""
+    *places, settled = st.columns(4)
+    columns = {"q_max": "q_mobile_C", "R_o": "r_o_ohm", "state of health": "state_of_health"}
+    for place, (label, name) in zip(places, columns.items(), strict=True):
+        sd = "" if np.isnan(getattr(says, name)) else f"sd {says.sd_of(name) or 'not stated'}"
+        place.metric(label, says.shown(name), sd, "off", delta_arrow="off")
+    settled.metric("settled", says.state.removesuffix(" settled").replace("settled", "yes"))
+    if says.reason:
+        st.error(f"Not settled: {says.reason}")
 
 
 def over_the_life(table: pd.DataFrame, column: str, label: str, scale: float) -> go.Figure:
     """A number of all cells over their discharges, with its standard deviation; what is not settled is hollow, without."""
     figure = go.Figure(layout={"yaxis_title": label, "xaxis_title": "discharge", **LAYOUT})
-    for colour, (cell, rows) in zip(COLOURS * len(table), table.groupby("cell", sort=False), strict=False):
+    for colour, (cell, rows) in zip(qualitative.T10 * len(table), table.groupby("cell", sort=False), strict=False):
         number = rows["cycle"].fillna(pd.Series(range(1, len(rows) + 1), rows.index))
         settled = rows[f"settled_{column.rpartition('_')[0]}"].astype(bool)
         sd, symbol = rows[f"sd_{column}"].where(settled), np.where(settled, "circle", "circle-open")
@@ -70,27 +175,32 @@ def over_the_life(table: pd.DataFrame, column: str, label: str, scale: float) ->
     return figure
 
 
-def ahead(chosen: Found, life: Life | None, settings: Settings) -> None:
+def show_end(chosen: Found, life: Life | None, settings: Settings) -> None:
     """The end of a discharge of which a part was seen, beside what was measured later."""
     st.subheader("When will it be empty?")
-    whole, share = chosen.discharge, st.slider("seen (%)", 10, 100, 100 if chosen.says.in_progress else 60)
-    given_A = st.number_input("load to come (A); 0: as so far", 0.0, value=0.0, step=0.1)
+    left, right = st.columns(2)
+    whole, share = chosen.discharge, left.slider("seen (%)", 10, 100, 100 if chosen.says.in_progress else 60)
+    given_A = right.number_input("load to come (A)", 0.001, value=None, placeholder="as so far", step=0.1)
     seen = whole.until(float(whole.time_s[0] + share / 100.0 * np.ptp(whole.time_s)))
-    load, count = constant(given_A, "current") if given_A else None, life.table["valid"].sum() if life else 0
+    load = constant(given_A, "current") if given_A else None
     end, _, error = attempt(partial(forecast_end, life=life), seen, settings, load)
     if error:
         st.error(error)
         return
     low, median, high = end.eod_quantile_s() / 60.0
-    st.markdown(f"**Empty at {median:.1f} min**, nine in ten from {low:.1f} to {high:.1f} min ({count} earlier discharges)")
+    before = f" ({life.table['valid'].sum()} discharges, taken for the ones right before it, were known)" if life else ""
+    st.markdown(f"**Empty at {median:.1f} min**, nine in ten from {low:.1f} to {high:.1f} min{before}")
     figure = go.Figure(layout={"xaxis_title": "time (min)", "yaxis_title": "voltage (V)", **LAYOUT})
     edge: dict[str, Any] = {"x": end.time_s / 60.0, "line_width": 0, "mode": "lines"}
     figure.add_scatter(y=end.voltage_V[0], showlegend=False, **edge)
-    figure.add_scatter(y=end.voltage_V[2], fill="tonexty", fillcolor="rgba(0, 114, 178, 0.3)", name="voltage, 90 %", **edge)
-    figure.add_scatter(x=edge["x"], y=end.voltage_V[1], line_color=COLOURS[0], mode="lines", name="voltage, median")
-    figure.add_scatter(x=whole.time_s / 60.0, y=whole.voltage_V, line={"color": "#777777", "dash": "dot"}, name="measured")
+    figure.add_scatter(y=end.voltage_V[2], fill="tonexty", fillcolor="rgba(76, 120, 168, 0.3)", name="voltage, 90 %", **edge)
+    figure.add_scatter(x=edge["x"], y=end.voltage_V[1], line_color=qualitative.T10[0], mode="lines", name="voltage, median")
+    measured = whole.loaded_part(settings.cut_off_V)
+    figure.add_scatter(
+        x=measured.time_s / 60.0, y=measured.voltage_V, line={"color": "#777777", "dash": "dot"}, name="measured"
+    )
     first, last = np.minimum([low, high], edge["x"][-1])
-    figure.add_vrect(first, last, fillcolor=COLOURS[1], opacity=0.3, line_width=0, name="empty, 90 %", showlegend=True)
+    figure.add_vrect(first, last, fillcolor=qualitative.T10[1], opacity=0.3, line_width=0, name="empty, 90 %", showlegend=True)
     figure.add_vline(x=end.now_s / 60.0, line_dash="dash", name="seen until here", showlegend=True)
     st.plotly_chart(figure)
     st.caption(f"Of the part that was seen: {' '.join(end.notes)}" if end.notes else "")
@@ -100,47 +210,39 @@ def main() -> None:
     """The page, from top to bottom."""
     st.set_page_config("battery-calibrate", layout="wide")
     st.title("How worn is the cell, and when is it empty?")
-    files: Any = st.sidebar.file_uploader("Drop the files of your tester", accept_multiple_files=True)
-    folder = st.sidebar.text_input("or name a folder of this machine, or a bundled cell: B0005")
-    one_cell = st.sidebar.checkbox("all files are of one cell, the oldest first")
-    cut_off_V = st.sidebar.number_input("cut-off (V)", 0.5, value=2.7, step=0.1)
-    nominal_Ah = st.sidebar.number_input("nominal capacity (Ah); 0: not known", 0.0, value=0.0, step=0.1)
-    st.sidebar.caption("Computed on this machine, and nothing is stored: closing the page forgets all of it.")
-    settings, state = Settings(cut_off_V=cut_off_V, nominal_Ah=nominal_Ah or None), st.session_state
-    asked = [each.file_id for each in files], folder, one_cell, settings
+    asked, state = ask(), st.session_state
     if state.get("asked") != asked:
-        names, state.lives = [Path(each.name).name for each in files], {}
-        state.troubles = [f"**{each}**: only one of this name is used" for each in {*names} if names.count(each) > 1]
-        with tempfile.TemporaryDirectory() as given:
-            for name, each in zip(names, files, strict=True):
-                Path(given, name).write_bytes(each.getvalue())
-            state.found = calibrated([each for each in (files and given, folder) if each], settings, one_cell, state.troubles)
-        state.troubles, state.asked = [each.replace(f"{given}/", "") for each in dict.fromkeys(state.troubles)], asked
+        answer(*asked)
+        state.asked = asked
     if state.troubles:
         st.warning("\n\n".join(state.troubles))
+    if state.table:
+        ask_how_to_read(*state.table)
     found: list[Found] = state.found
     if not found:
-        st.info("Give discharges at the left. Each starts with a full cell at rest; the last one may be in progress.")
+        st.info("Give discharges at the left. The last one of a cell may be in progress.")
         return
     chosen = found[st.selectbox("discharge", range(len(found)), len(found) - 1, format_func=lambda n: found[n].name) or 0]
-    says, (q_max, r_o, health, settled) = chosen.says, st.columns(4)
-    q_max.metric("q_max", says.shown("q_mobile_C"), f"sd {says.sd_of('q_mobile_C') or 'not stated'}", "off", delta_arrow="off")
-    r_o.metric("R_o", says.shown("r_o_ohm"), f"sd {says.sd_of('r_o_ohm') or 'not stated'}", "off", delta_arrow="off")
-    health.metric("state of health", says.shown("state_of_health"), help="give the nominal capacity at the left")
-    settled.metric("settled", says.state.removesuffix(" settled").replace("settled", "yes"))
-    if says.reason:
-        st.error(f"Not settled: {says.reason}")
-    table = pd.DataFrame({"record": each.name, "cell": each.cell} | each.says.row() for each in found)
-    left, right = st.columns(2)
-    left.plotly_chart(over_the_life(table, "q_mobile_C", "q_max (Ah)", 1.0 / 3600.0))
-    right.plotly_chart(over_the_life(table, "r_o_ohm", "R_o (mohm)", 1e3))
     of_cell = [each for each in found if each.cell == chosen.cell]
     if len(of_cell) > 1 and chosen.cell not in state.lives:
-        state.lives[chosen.cell] = attempt(track_life, [each.discharge for each in of_cell], cut_off_V).result
+        state.lives[chosen.cell] = attempt(life_before, [each.discharge for each in of_cell], state.settings).result
     life, earlier = state.lives.get(chosen.cell), [each.name for each in of_cell].index(chosen.name)
-    ahead(chosen, attempt(life.after, earlier).result if life and earlier else None, settings)
-    st.dataframe(table)
-    st.download_button("the table as CSV", table.to_csv(index=False), "estimate.csv", "text/csv")
+    before = attempt(life.after, earlier).result if life and earlier else None
+    table = pd.DataFrame({"record": each.name, "cell": each.cell} | each.says.row() for each in found)
+    lives = table[table.groupby("cell")["cell"].transform("size") > 1]
+    if lives.empty:
+        show_end(chosen, before, state.settings)
+        show_numbers(chosen.says)
+    else:
+        show_numbers(chosen.says)
+        left, right = st.columns(2)
+        left.plotly_chart(over_the_life(lives, "q_mobile_C", "q_max (Ah)", 1.0 / 3600.0))
+        right.plotly_chart(over_the_life(lives, "r_o_ohm", "R_o (mohm)", 1e3))
+        show_end(chosen, before, state.settings)
+    short = [{label: each.says.shown(name, with_unit=False) for label, name in SHORT.items()} for each in found]
+    settled = [each.says.state for each in found]
+    st.dataframe(table[["record", "cell"]].join(pd.DataFrame(short)).assign(settled=settled), hide_index=True)
+    st.download_button("the table with all columns as CSV", table.to_csv(index=False), "estimate.csv", "text/csv")
 
 
 if __name__ == "__main__":

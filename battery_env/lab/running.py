@@ -25,7 +25,6 @@ from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import Source, find_sources, read_source, record_name
 from battery_env.loads import Load, LoadToCome
-from battery_env.plotting import literal
 from battery_env.records.discharge import Discharge
 
 # By name of the column of a profile: the unit of the load.
@@ -105,6 +104,8 @@ class End:
             if path.suffix == ".json":
                 part.write_text(json.dumps(self.row(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
             else:
+                from battery_env.plotting import literal  # here, as matplotlib takes long to import
+
                 figure = self.forecast.plot()
                 figure.suptitle(f"{literal(self.name)}, then {self.forecast.load_name}", fontsize=10)
                 figure.savefig(part, dpi="figure")
@@ -206,6 +207,13 @@ def _read_life(arguments: Sequence[str], running: Source, file_format: FileForma
     return discharges
 
 
+def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
+    """The life of a cell, by whole discharges that are looked at as the next one is."""
+    calibrator = replace(settings, method="least-squares", initial_soc=1.0).calibrator()
+    assert isinstance(calibrator, LeastSquares)
+    return track_life(discharges, settings.cut_off_V, calibrator)
+
+
 def end_of_record(
     argument: str, settings: Settings, file_format: FileFormat, life: Sequence[str] = (), load: Path | None = None
 ) -> End:
@@ -225,9 +233,7 @@ def end_of_record(
         named = sorted({each.meta["cell"] for each in [*before, running] if "cell" in each.meta})
         if len(named) > 1:
             raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")
-        calibrator = replace(settings, method="least-squares", initial_soc=1.0).calibrator()
-        assert isinstance(calibrator, LeastSquares)
-        past = track_life(before, settings.cut_off_V, calibrator)
+        past = life_before(before, settings)
         settings = replace(settings, prior_q_mobile_C=past.prior_for(running, to_come))
     found = calibrated(running, settings, to_come, end_is_asked=True)
     if not found.in_progress:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
@@ -12,7 +14,7 @@ from battery_env.checks import check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
-from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit
+from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.kalman.filter import PRIOR_SD_SHARE_Q, ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
@@ -163,6 +165,26 @@ class Settings:
             known = {"cut_off_V": cell.cell.VEOD, "mismatch_V": cell.mismatch_V, "thermal": False, "path": cell}
             others, cell = {**known, **others}, cell.cell
         return cls(**{"cell": cell, **others})
+
+    @classmethod
+    def for_file(cls, path: Path | None, **others: Any) -> Settings:
+        """
+        Settings that use what a file says of a cell, if there is one; a fit that is in doubt is warned of.
+
+        :param path: what the command fit, ``CellParameters.to_json`` or ``AgingPath.to_json`` wrote
+        :param others: further settings, as of :meth:`for_cell`
+        """
+        if path is None:
+            return cls(**others)
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"no file {str(path)!r} for --cell: give what the command fit, CellParameters.to_json or AgingPath.to_json "
+                "wrote"
+            )
+        cell = read_cell(path)
+        if isinstance(cell, CellFit) and cell.doubt:
+            warnings.warn(f"{path}: {cell.doubt}", stacklevel=2)
+        return cls.for_cell(cell, **others)
 
     def with_nominal_prior(self) -> Settings:
         """What a nominal capacity tells of a cell of another size than a new 18650, of which nothing else is known."""

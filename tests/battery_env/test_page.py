@@ -1,15 +1,18 @@
 """The page for the bench, in Streamlit's test of pages."""
 
 import io
+import signal
+import socket
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from battery_env import NEW_CELL, calibrate, load_nasa_discharges
 from battery_env import __file__ as package
-from battery_env import calibrate, load_nasa_discharges
 from battery_env.__main__ import calibrate as command
 
 pytest.importorskip("streamlit")
@@ -40,7 +43,8 @@ def _same_program(monkeypatch):
 
 
 @pytest.fixture
-def page():
+def page(monkeypatch):
+    monkeypatch.setattr("streamlit.get_option", lambda name: "secret")  # as in an address that has one
     shown = AppTest.from_file(str(PAGE), default_timeout=120).run()
     assert not shown.exception and "Give discharges" in shown.info[0].value
     return shown
@@ -105,16 +109,69 @@ def test_files_are_dropped_and_nothing_is_stored(folder, page, tmp_path_factory,
     assert list(kept.iterdir()) == []
 
 
+def test_columns_units_sign_start_and_constants_are_stated_where_a_file_does_not_tell_them(page, tmp_path):
+    discharge = LIFE[0]
+    columns = {"alpha": discharge.time_s / 60.0, "beta": discharge.voltage_V, "gamma": -1e3 * discharge.current_A}
+    odd = ("odd.csv", pd.DataFrame(columns).to_csv(index=False).encode(), "text/csv")
+    page.sidebar.file_uploader[0].set_value([odd]).run()
+    assert page.warning[0].value.startswith("**odd.csv**: no column for the time, the voltage, the current")
+    assert "alpha, beta, gamma" in page.code[0].value and page.expander[0].proto.expanded
+    for quantity, column, unit in (("time", "alpha", "min"), ("voltage", "beta", "V"), ("current", "gamma", "mA")):
+        page.selectbox(key=f"column of {quantity}").set_value(column)
+        page.selectbox(key=f"unit of {quantity}").set_value(unit)
+    page.selectbox(key="sign").set_value("negative")
+    page.button[0].click().run()
+    says = calibrate(discharge)
+    assert numbers(page)["q_max"] == says.shown("q_mobile_C") and not page.warning
+    # one discharge has no life, and its end stands first
+    assert [each.value for each in page.subheader] == ["When will it be empty?"] and len(page.get("plotly_chart")) == 1
+
+    cell = replace(NEW_CELL, r_o=0.2).to_json(tmp_path / "my_cell.json").read_bytes()
+    page.sidebar.file_uploader[0].set_value([odd, ("my_cell.json", cell, "application/json")])
+    page.sidebar.selectbox[0].set_value("with a known charge").run()
+    says = calibrate(discharge, cell=replace(NEW_CELL, r_o=0.2), initial_soc=0.8)
+    assert numbers(page)["q_max"] == says.shown("q_mobile_C") and not page.warning
+    assert float(numbers(page)["state of health"]) == pytest.approx(says.state_of_health, abs=2e-3)
+    (health,) = (each for each in page.metric if each.label == "state of health")
+    assert health.delta == f"sd {says.sd_of('state_of_health')}"
+    page.sidebar.file_uploader[0].set_value([odd, ("my_cell.json", b"{}", "application/json")]).run()
+    assert page.warning[0].value.startswith("my_cell.json") and page.info
+
+
+def test_whoever_starts_the_page_without_a_secret_address_offers_no_folder():
+    shown = AppTest.from_file(str(PAGE), default_timeout=120).run()
+    assert shown.info and not shown.sidebar.text_input
+
+
 def test_a_name_that_is_nearly_a_command_is_no_file(capsys):
     assert command(["forcast", "x.csv"]) == 2
     assert "did you mean battery-calibrate forecast?" in capsys.readouterr().err
 
 
-def test_the_command_opens_the_page_on_this_machine_only(monkeypatch):
-    called = []
-    monkeypatch.setattr("subprocess.run", lambda words, **_: called.append(words) or type("Done", (), {"returncode": 0}))
-    assert command(["page", "--port", "8600"]) == 0
-    assert called[0][1:5] == ["-m", "streamlit", "run", str(PAGE)]
-    assert called[0][called[0].index("--server.address") + 1] == "localhost" and "8600" in called[0]
+def test_without_streamlit_the_command_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setattr("battery_env.lab.command_line.find_spec", lambda name: None)
-    assert command(["page"]) == 2 and len(called) == 1
+    assert command(["page"]) == 2 and "pip install 'battery_env[page]'" in capsys.readouterr().err
+
+
+def test_the_page_opens_without_a_question_and_answers_nobody_without_its_address(start_page):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        page = start_page(taken.getsockname()[1])
+        assert page.port > taken.getsockname()[1]
+    assert page.opened() == page.address.rstrip("/")
+    assert page.answer("/_stcore/health", page.token) == 200
+    for path in ("/", "/_stcore/health", "/_stcore/stream", "/_stcore/upload_file/a/b"):
+        assert page.answer(path) == 404
+    own = f"127.0.0.1:{page.port}"
+    stream = {
+        (own, f"http://{own}"): 101,
+        ("evil.example", f"http://{own}"): 403,
+        (own, "http://evil.example"): 403,
+        ("evil.example", "http://evil.example"): 403,  # of a name that leads here
+    }
+    for (host, origin), status in stream.items():
+        upgrade = {"Host": host, "Origin": origin, "Connection": "Upgrade", "Upgrade": "websocket"}
+        key = {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version": "13"}
+        assert page.answer("/_stcore/stream", page.token, upgrade | key) == status, (host, origin)
+    page.leave_a_file()
+    page.ends_by(signal.SIGKILL)
+    assert page.left() == []
