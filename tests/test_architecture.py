@@ -251,10 +251,13 @@ def test_no_function_is_long_and_no_private_name_leaves_its_module(path):
 #: The most of each that there may be, and no more than there is. It may fall, and its number with it. To raise one takes a
 #: sentence beside it that names the user who needs it, and what went for it.
 MOST = {
-    ("lines", "battery_env"): 19_093,
+    # 196 for the page: whoever writes no code and has a file that is read wrongly, and the owner of a shared machine, whom a
+    # secret address and the process that removes files protect; what the command did of it is shared, and nothing else went
+    ("lines", "battery_env"): 19_288,
     ("lines", "sb3_lac"): 6_931,
     ("lines", "benchmarks"): 6_469,
-    ("lines", "tests"): 18_300,
+    # the same users: the page is started, asked by strangers, killed, and looked at in a browser
+    ("lines", "tests"): 18_569,
     ("numbers at the top of modules", "battery_env"): 206,
     ("numbers at the top of modules", "sb3_lac"): 20,
     ("starred calls", "battery_env"): 68,
