@@ -257,7 +257,7 @@ MOST = {
     ("lines", "sb3_lac"): 6_931,
     ("lines", "benchmarks"): 6_469,
     # the same users: the page is started, asked by strangers, killed, and looked at in a browser
-    ("lines", "tests"): 18_569,
+    ("lines", "tests"): 18_577,
     ("numbers at the top of modules", "battery_env"): 206,
     ("numbers at the top of modules", "sb3_lac"): 20,
     ("starred calls", "battery_env"): 68,
