@@ -396,7 +396,7 @@ def test_a_load_that_is_switched_between_rows_leaves_no_wrong_number_settled(ste
         assert "switched between" not in followed.reason and followed.q_mobile == pytest.approx(6000.0, rel=0.01)
 
 
-@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault not in UNOBSERVABLE])
+@pytest.mark.parametrize("fault", sweep(*(fault for fault in FAULTS if fault not in UNOBSERVABLE)))
 def test_a_stream_and_a_trace_say_what_the_whole_record_says(fault):
     rng = np.random.default_rng((3, FAULTS.index(fault)))
     case = broken(drawn(rng, ()), fault, rng)

@@ -20,7 +20,7 @@ from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_lac import LAC, CertificateCallback, LyapunovCallback, certify, evaluate_lyapunov
-from sb3_lac.stability import rollout, statistics
+from sb3_lac.stability import fitting, rollout, statistics
 from sb3_lac.stability.statistics import Bootstrap, decrease_by_cost, exact_percentile, ratio
 
 RHO = 0.5
@@ -437,6 +437,13 @@ def test_callback_logs_the_metrics(make_model, make_env, tmp_path, capsys):
     assert path.read_bytes() == content
 
 
+@pytest.fixture
+def brief_fit(monkeypatch):
+    """Functions that are no good, and soon there."""
+    monkeypatch.setattr(fitting, "N_ITERATIONS", 2)
+
+
+@pytest.mark.usefixtures("brief_fit")
 @pytest.mark.filterwarnings("ignore:Observations lie far")
 @pytest.mark.parametrize("make_callback", [LyapunovCallback, CertificateCallback])
 def test_callbacks_of_stable_baselines3_stop_a_training_after_an_evaluation(make_model, make_env, make_callback):
@@ -452,7 +459,7 @@ def test_callbacks_of_stable_baselines3_stop_a_training_after_an_evaluation(make
         assert model.learn(40, callback=make_callback(make_env(), stop, **options)).num_timesteps == steps
 
 
-# The functions are fitted on few episodes
+@pytest.mark.usefixtures("brief_fit")
 @pytest.mark.filterwarnings("ignore:Observations lie far")
 @pytest.mark.parametrize("algorithm", [LAC, SAC])
 def test_training_with_callback_is_the_same_to_the_bit(make_env, algorithm):
