@@ -255,12 +255,12 @@ MOST = {
     # secret address and the process that removes files protect; what the command did of it is shared, and nothing else went
     ("lines", "battery_env"): 19_288,
     ("lines", "sb3_lac"): 6_931,
-    ("lines", "benchmarks"): 6_469,
+    ("lines", "benchmarks"): 6_467,
     # the same users: the page is started, asked by strangers, killed, and looked at in a browser
-    ("lines", "tests"): 18_577,
-    ("numbers at the top of modules", "battery_env"): 206,
+    ("lines", "tests"): 18_568,
+    ("numbers at the top of modules", "battery_env"): 205,
     ("numbers at the top of modules", "sb3_lac"): 20,
-    ("starred calls", "battery_env"): 68,
+    ("starred calls", "battery_env"): 63,
     ("starred calls", "sb3_lac"): 41,
     ("options", "battery-calibrate"): 24,
 }

@@ -39,18 +39,7 @@ def few(parameters, mismatch):
 
 
 def test_it_writes_policies_with_their_cards_and_those_for_recorded_cells_beside_them(train_briefly, tmp_path, capsys):
-    arguments = [
-        "--envs",
-        "BatteryVoltageJoint-v0",
-        "--updates",
-        "100",
-        "--discharges",
-        "2",
-        "--jobs",
-        "1",
-        "--out",
-        str(tmp_path),
-    ]
+    arguments = [*"--envs BatteryVoltageJoint-v0 --updates 100 --discharges 2 --jobs 1 --out".split(), str(tmp_path)]
     pretrained.main(arguments)
     policy, options = policy_of_file(tmp_path / "BatteryVoltageJoint-v0.onnx")
     assert policy.env_id == "BatteryVoltageJoint-v0" and options == pretrained.OPTIONS

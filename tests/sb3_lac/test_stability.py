@@ -437,16 +437,10 @@ def test_callback_logs_the_metrics(make_model, make_env, tmp_path, capsys):
     assert path.read_bytes() == content
 
 
-@pytest.fixture
-def brief_fit(monkeypatch):
-    """Functions that are no good, and soon there."""
-    monkeypatch.setattr(fitting, "N_ITERATIONS", 2)
-
-
-@pytest.mark.usefixtures("brief_fit")
 @pytest.mark.filterwarnings("ignore:Observations lie far")
 @pytest.mark.parametrize("make_callback", [LyapunovCallback, CertificateCallback])
-def test_callbacks_of_stable_baselines3_stop_a_training_after_an_evaluation(make_model, make_env, make_callback):
+def test_callbacks_of_stable_baselines3_stop_a_training_after_an_evaluation(make_model, make_env, make_callback, monkeypatch):
+    monkeypatch.setattr(fitting, "N_ITERATIONS", 2)  # a function that is no good, and soon there
     options = {"n_eval_episodes": 4, "eval_freq": 10, "seed": 1000, "verbose": 0}
     # A policy that never changes: the second evaluation is as good as the first, and the third is one too many
     model = make_model(n_collect=0, learning_starts=1000, learning_rate=0.0)
@@ -459,10 +453,11 @@ def test_callbacks_of_stable_baselines3_stop_a_training_after_an_evaluation(make
         assert model.learn(40, callback=make_callback(make_env(), stop, **options)).num_timesteps == steps
 
 
-@pytest.mark.usefixtures("brief_fit")
 @pytest.mark.filterwarnings("ignore:Observations lie far")
 @pytest.mark.parametrize("algorithm", [LAC, SAC])
-def test_training_with_callback_is_the_same_to_the_bit(make_env, algorithm):
+def test_training_with_callback_is_the_same_to_the_bit(make_env, algorithm, monkeypatch):
+    monkeypatch.setattr(fitting, "N_ITERATIONS", 2)
+
     def train(callback):
         env = VecNormalize(make_vec_env(make_env, n_envs=2, seed=0), gamma=0.99)
         options = {"learning_starts": 20, "batch_size": 16, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}}
