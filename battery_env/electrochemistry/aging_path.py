@@ -16,6 +16,7 @@ from battery_env.checks import check_positive, check_whole_number
 from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS, CellParameters, check_cell
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import more_errors_per_C
+from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.files import read_json, write_json
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O
 
@@ -225,11 +226,12 @@ def _normal_distances(squares: FloatArray, count: int) -> FloatArray:
 
 
 def cell_with(cell: CellParameters, constants: Mapping[str, float] | None) -> CellParameters:
-    """A cell with constants that were found along a path, told from its own by ``PATH_NAMES``; ``None``: none were."""
-    if constants is None:
-        return cell
-    rates = {name: getattr(cell, name) * float(np.exp(constants[name])) for name in UNCERTAIN_CONSTANTS}
-    return with_equilibrium(cell.replace(**rates), [constants[name] for name in EQUILIBRIUM_NAMES])
+    """A cell with constants that were found beside its parameters, told from its own; ``None``: none were."""
+    found = constants or {}
+    rates = {name: getattr(cell, name) * float(np.exp(found[name])) for name in RATE_CONSTANTS if name in found}
+    if EQUILIBRIUM_NAMES[0] in found:
+        cell = with_equilibrium(cell, [found[name] for name in EQUILIBRIUM_NAMES])
+    return cell.replace(**rates) if rates else cell
 
 
 def _at(rows: FloatArray, place: FloatArray) -> FloatArray:

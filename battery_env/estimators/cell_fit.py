@@ -25,6 +25,8 @@ from battery_env.parameters import Q_MOBILE
 #: How well the constants that say how fast a cell follows its load are known before any data: standard deviations of their
 #: logarithms. The overpotential of kn stands for whatever slows a worn cell down, so that it may differ most.
 RATE_PRIOR_SD: Mapping[str, float] = {"kn": 1.5, "kp": 0.5, "tDiffusion": 0.5, "to": 0.5, "tsn": 0.5, "tsp": 0.5}
+#: Cells of one kind differ by so much in each of them, also as standard deviations of logarithms.
+SAME_KIND_SD = 0.2
 #: A constant is identified if the discharges leave less than this share of the standard deviation of its prior.
 IDENTIFIED_SHARE = 0.5
 #: Error to expect on a real cell of constants that were not fitted to it, V.
@@ -207,9 +209,17 @@ class CellFit:
             "thermal": self.thermal,
             "mismatch_V": self.mismatch_V,
             "q_mobile_bounds_C": self.q_mobile_bounds_C,
-            "cell_sd_r_o_ohm": self.sd_r_o_ohm,
+            "nuisance": self.rates_sd,
         }
         return LeastSquares(**{**own, **arguments})
+
+    @property
+    def rates_sd(self) -> dict[str, float]:
+        """
+        How well the constants that say how fast the cell follows its load are known for another discharge, or another cell of
+        the kind: standard deviations of their logarithms, by name.
+        """
+        return {each.name: hypot(each.sd, SAME_KIND_SD) for each in self.constants if each.name in RATE_PRIOR_SD}
 
     @property
     def sd_r_o_ohm(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from math import log, sqrt
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, PATH_NAMES, AgingPath
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD
+from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, INDEPENDENT_ERRORS, LEAST_MISMATCH_V, LIMIT_V, fit_cell
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import Prior, Search, spread_over
@@ -102,10 +104,10 @@ def _fit_age(record: Record, model: RecordModel, reference: LeastSquares, cut_of
     samples = check_record(loaded)
     nuisance = {name: RATE_PRIOR_SD[name] for name in UNCERTAIN_CONSTANTS}
     nuisance |= dict(zip(EQUILIBRIUM_NAMES, EQUILIBRIUM_PRIOR_SD_V, strict=True))
-    search = Search.of(samples, model, PARAMETER_NAMES, nuisance, reference.bounds)
-    weight_V, q_C = sqrt(len(samples.time_s) / INDEPENDENT_ERRORS) * _MISMATCH_V, reference.estimate(loaded).q_mobile
-    priors = [Prior(name, 0.0, weight_V / sd) for name, sd in nuisance.items()]
-    priors.append(Prior("q_mobile", q_C, weight_V / (_SAME_Q_SHARE * q_C)))
+    error_V, q_C = sqrt(len(samples.time_s) / INDEPENDENT_ERRORS) * _MISMATCH_V, reference.estimate(loaded).q_mobile
+    search = replace(Search.of(samples, model, PARAMETER_NAMES, nuisance, reference.bounds), error=ErrorModel(noise_V=error_V))
+    priors = [Prior(name, 0.0, 1.0 / sd) for name, sd in nuisance.items()]
+    priors.append(Prior("q_mobile", q_C, 1.0 / (_SAME_Q_SHARE * q_C)))
     fit = search.best(search.starts([q_C])[0], priors)
     values = {**fit.values, **{name: log(fit.values[name]) for name in PARAMETER_NAMES}}
     error_V = float(np.sqrt(np.mean(fit.residual_V**2)))

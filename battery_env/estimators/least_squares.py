@@ -15,15 +15,16 @@ from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES, AgingPath
 from battery_env.electrochemistry.ends import LONGEST_S
-from battery_env.electrochemistry.model_error import independent_errors, more_errors_per_C
+from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_errors
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.evidence import evidence_of, measured, start_reason, unseen_C
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
+from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.reasons import SETTLED_SHARES, Reason
-from battery_env.estimators.search import Fit, JointPrior, Prior, Search, square
+from battery_env.estimators.search import MARGIN, Fit, JointPrior, Prior, Search, square
 from battery_env.estimators.verdict import (
     MISMATCH_MARGIN,
     MOST_NOISE_SD,
@@ -55,7 +56,7 @@ class _Fitted:
     search: Search
     fit: Fit  # with all priors
     alone: Fit  # without the prior of q_mobile
-    variance_V2: float  # of one residual, with what the error of the model adds
+    variance: float  # of one residual as it is weighed
     hidden_sd: Mapping[str, float]  # of what does not show in the voltage, charges that nobody saw among it, by parameter
     evidence: Any  # what the samples show, a row of ``EVIDENCE``
 
@@ -63,7 +64,7 @@ class _Fitted:
         """The standard deviations of a fit, so many times as large as it says, with those of what does not show."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.search.parameters, _root_inverse_diagonal(fit.jacobian), strict=False):
-            sd[name] = hypot(ratios.get(name, 1.0) * sqrt(self.variance_V2) * float(root), self.hidden_sd[name])
+            sd[name] = hypot(ratios.get(name, 1.0) * sqrt(self.variance) * float(root), self.hidden_sd[name])
         return sd
 
 
@@ -139,7 +140,6 @@ class LeastSquares(Estimator):
         to those of the parameters. :func:`battery_env.soc_from_rest` tells it from the voltage of the rest before the load
     :param path: how cells of this kind age (:func:`battery_env.fit_life`): which constants, ``q_mobile`` and ``r_o`` go
         together before this record is seen. ``cell`` and ``mismatch_V`` are those of the path by default
-    :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``: its standard deviation by theirs, ohm
     :raises ValueError: for an argument out of range
     """
 
@@ -160,7 +160,6 @@ class LeastSquares(Estimator):
         nuisance: Mapping[str, float] | None = None,
         initial_soc: InitialSoc = 1.0,
         path: AgingPath | None = None,
-        cell_sd_r_o_ohm: float = 0.0,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
@@ -183,8 +182,7 @@ class LeastSquares(Estimator):
             if not 0.0 < prior_q_mobile_C[1] < np.inf:
                 raise ValueError(f"prior_q_mobile_C is (mean, sd) with sd > 0, got {prior_q_mobile_C!r}")
         self.prior_q_mobile_C = prior_q_mobile_C
-        check_not_negative(mismatch_V=mismatch_V, cell_sd_r_o_ohm=cell_sd_r_o_ohm)
-        self.cell_sd_r_o_ohm = cell_sd_r_o_ohm
+        check_not_negative(mismatch_V=mismatch_V)
         self.mismatch_V = mismatch_V
         self.current_gain_sd = check_gain_sd(current_gain_sd)
         self._at_rest = initial is None
@@ -250,39 +248,43 @@ class LeastSquares(Estimator):
         fitted = self._fitted(record, search, starts, history)
         sd = fitted.sd(fitted.fit, dict.fromkeys(self.parameters, self._sd_ratio))
         values, verdict = fitted.fit.values, self._verdict(record, history, fitted)
-        constants = None if self.path is None else {name: values[name] for name in self.nuisance}
+        constants = {name: values[name] for name in self.nuisance if name != "offset_V"} or None
         return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict(), constants=constants)
 
     def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]], history: ChargeHistory) -> _Fitted:
         """The best fits with and without the prior, and what their standard deviations are made of."""
-        n = len(search.data.time_s)
-        noise_V = self.voltage_noise_V
-        if noise_V is None and self.nuisance:  # their priors are weighed against the white part of the residuals
-            noise_V = max(white_noise_V(search.residual(dict.fromkeys(self.nuisance, 0.0) | starts[0])[0]), _LEAST_NOISE_V)
-        more_per_C = more_errors_per_C("record", self.model.cell.q_mobile) if self.path is None else self.path.errors_per_C
-        errors = independent_errors(drawn_charge_C(record), more_per_C)
-        mismatch_V = sqrt(n / errors) * self.mismatch_V
-        weight_V = hypot(noise_V or 0.0, mismatch_V)
-        priors: list[Prior | JointPrior] = [Prior(name, 0.0, weight_V / sd) for name, sd in self.nuisance.items()]
-        if self.path is not None:
+        noise_V, at_start_V = self.voltage_noise_V, search.residual(dict.fromkeys(self.nuisance, 0.0) | starts[0])[0]
+        if noise_V is None and (self.nuisance or self.mismatch_V):  # what else is known is weighed against it
+            noise_V = max(white_noise_V(at_start_V), _LEAST_NOISE_V)
+        if self.path is None:
+            priors: list[Prior | JointPrior] = [Prior(name, 0.0, 1.0 / sd) for name, sd in self.nuisance.items()]
+            cell, drift_V = self.model.cell, WHOLE_ERROR * self.mismatch_V
+            if drift_V and noise_V and self._at_rest:  # it is no smaller than the voltage at rest shows, beyond noise
+                start_V2 = float(at_start_V[0]) ** 2 - (MOST_NOISE_SD * noise_V) ** 2 - self.mismatch_V**2
+                drift_V = hypot(drift_V, sqrt(max(start_V2, 0.0)))
+            error = ErrorModel(drift_V, noise_V or 1.0, cell.r_o, cell.to, history.load_on_C)
+        else:
             mean, covariance = self.path.moments
-            priors = [JointPrior(PATH_NAMES, mean, weight_V * np.linalg.cholesky(np.linalg.inv(covariance)).T)]
+            priors = [JointPrior(PATH_NAMES, mean, np.linalg.cholesky(np.linalg.inv(covariance)).T)]
+            errors = independent_errors(drawn_charge_C(record), self.path.errors_per_C)
+            mismatch_V = sqrt(len(search.data.time_s) / errors) * self.mismatch_V
+            error = ErrorModel(noise_V=hypot(noise_V or 0.0, mismatch_V))
+        search = replace(search, error=error)
         alone = fit = search.best(starts, priors)
+        variance = 1.0 if noise_V else square(alone.residual_V) / (len(alone.residual_V) - len(self.parameters))
         if self.path is not None:
             # what goes together along the path is a prior of q_mobile too, on which a settled estimate must not rest
-            data, sds = fit.jacobian[:n], np.array(list(self.nuisance.values()))
-            loose = np.pad(np.diag(weight_V / sds), ((0, 0), (len(self.parameters), 0)))
-            alone = replace(fit, jacobian=np.vstack([data, loose]))
-        noise_V2 = noise_V**2 if noise_V else square(alone.residual_V) / (n - len(self.parameters))
-        # one error of the model is no smaller than the voltage at rest shows, beyond noise
-        start_V2 = float(alone.residual_V[0]) ** 2 - MOST_NOISE_SD**2 * noise_V2
-        variance_V2 = noise_V2 + mismatch_V**2 + n / errors**2 * max(start_V2 - self.mismatch_V**2, 0.0)
+            loose = np.pad(np.diag(1.0 / np.array(list(self.nuisance.values()))), ((0, 0), (len(self.parameters), 0)))
+            alone = replace(fit, jacobian=np.vstack([fit.jacobian[: len(fit.residual_V)], loose]))
+            # one error of the model is no smaller than the voltage at rest shows, beyond noise
+            start_V2 = float(fit.residual_V[0]) ** 2 - (MOST_NOISE_SD * (noise_V or 0.0)) ** 2 - self.mismatch_V**2
+            variance += len(fit.residual_V) * max(start_V2, 0.0) / (errors * error.noise_V) ** 2
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
-            carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance_V2) / sd_C)
+            carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance) / sd_C)
             fit = search.best([*starts, alone.values, *search.starts([mean_C])[0]], [*priors, carried])
         evidence = self._evidence(record, history, fit)
-        return _Fitted(search, fit, alone, variance_V2, self._hidden_sd(search, fit, unseen_C(evidence)), evidence)
+        return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, unseen_C(evidence)), evidence)
 
     def _evidence(self, record: Samples, history: ChargeHistory, fit: Fit) -> Any:
         """What the samples of a record show, with a fit, whose model may be empty before they end."""
@@ -311,19 +313,20 @@ class LeastSquares(Estimator):
                 moved["q_mobile"] *= soc / (soc + step)
                 by_soc[self.parameters.index("q_mobile")] = (moved["q_mobile"] - values["q_mobile"]) / step
             change_V = (nearby.residual(moved)[0] - at_V) / step
-            rows = np.nan_to_num(np.append(change_V, np.zeros(len(fit.jacobian) - len(change_V))))
+            error = search.error.along(search.data.time_s, search.data.samples_A, values["q_mobile"])
+            weighed = error.whitened(np.nan_to_num(change_V)[:, None])[:, 0]
+            rows = np.append(weighed, np.zeros(len(fit.jacobian) - len(weighed)))
             by_soc -= np.linalg.lstsq(fit.jacobian, rows, rcond=None)[0]
-        of_cell = {"r_o": self.cell_sd_r_o_ohm}
         return {
-            name: hypot(self.current_gain_sd * values[name], sd_soc * float(by_soc[n]), of_cell.get(name, 0.0))
+            name: hypot(self.current_gain_sd * values[name], sd_soc * float(by_soc[n]))
             for n, name in enumerate(self.parameters)
         }
 
     def _verdict(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> Verdict:
         """What speaks against an estimate."""
         fit, alone, evidence, (soc, sd_soc) = fitted.fit, fitted.alone, fitted.evidence, self.initial_soc
-        of_cell, ratio = {"of_cell_mohm": 1e3 * self.cell_sd_r_o_ohm}, {"q_mobile": self._sd_ratio}
-        diagnosis = Diagnosis(evidence, measured(evidence, soc, float(record.time_s[0]), history.charge) | of_cell)
+        ratio = {"q_mobile": self._sd_ratio}
+        diagnosis = Diagnosis(evidence, measured(evidence, soc, float(record.time_s[0]), history.charge))
         n, free, own, is_stated = (
             len(fit.residual_V),
             self.parameters,
@@ -334,23 +337,26 @@ class LeastSquares(Estimator):
         few = not is_stated and n < len(free) + SPARE_SAMPLES
         diagnosis.note(Reason.FEW, few, of="samples", or_else=", or state voltage_noise_V")
         noise_V = self.voltage_noise_V or white_noise_V(fit.residual_V)
-        limit_V2 = misfit_limit_V2(noise_V, n, self.mismatch_V, is_stated)
+        # of a path the error is what its cells leave, and else what the drift allows for
+        drift_V = fitted.search.error.drift_V or self.mismatch_V
+        limit_V2 = misfit_limit_V2(noise_V, n, drift_V, is_stated)
         diagnosis.note(Reason.MISFIT, square(fit.residual_V) > n * limit_V2)
-        rmse_V = sqrt(square(alone.residual_V) / n)
-        is_other = bool(start_reason(evidence) and self.mismatch_V and rmse_V**2 > limit_V2)
-        diagnosis.note(Reason.OTHER_KIND, is_other, rmse_mV=1e3 * rmse_V, mismatch_mV=1e3 * self.mismatch_V)
+        # a start of another charge shifts the voltage, and another kind of cell changes its course
+        course_V = float(np.std(alone.residual_V))
+        is_other = bool(start_reason(evidence) and self.mismatch_V and course_V**2 > limit_V2)
+        diagnosis.note(Reason.OTHER_KIND, is_other, rmse_mV=1e3 * course_V, mismatch_mV=1e3 * drift_V)
         q_mobile = fit.values["q_mobile"]
         diagnosis.note(Reason.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, self.model.cell.q_mobile))
-        _note_end(diagnosis, record, fitted, max(MISMATCH_MARGIN * self.mismatch_V, MOST_NOISE_SD * noise_V, RESOLUTION_V))
+        _note_end(diagnosis, record, fitted, max(MISMATCH_MARGIN * drift_V, MOST_NOISE_SD * noise_V, RESOLUTION_V))
         if self.path is not None:
             distance = self.path.distance_sd(fit.values)
             diagnosis.note(Reason.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)
-        moved_V2 = fit.square_V2 - alone.square_V2
-        diagnosis.note(Reason.Q_PRIOR_WRONG, moved_V2 > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance_V2)
+        moved = fit.square - alone.square
+        diagnosis.note(Reason.Q_PRIOR_WRONG, moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance)
         for name in fit.at_bound:
             diagnosis.note(Reason.Q_AT_BOUND.of(name))
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
-        known = Assumptions(self.current_gain_sd, sd_soc / soc, self.cell_sd_r_o_ohm, self.path is not None)
+        known = Assumptions(self.current_gain_sd, sd_soc / soc, is_along_path=self.path is not None)
         return diagnosis.verdict(alone.values, own, free, priors, known)
 
 
@@ -388,7 +394,7 @@ def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) 
 def _starts_along(path: AgingPath, search: Search) -> list[dict[str, float]]:
     """Where to start along a path: at what it expects of cells of some q_mobile, where the record allows for these."""
     (mean, covariance), q = path.moments, PATH_NAMES.index("q_mobile")
-    log_least = float(np.log(search.bounds["q_mobile"][0]))
+    log_least = float(np.log((1.0 + MARGIN) * search.least_q_C))
     log_q = mean[q] + np.sqrt(covariance[q, q]) * np.array(_STARTS_SD)
     starts = []
     for each in np.unique(np.maximum(log_q, log_least + _START_ABOVE)):

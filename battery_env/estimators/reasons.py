@@ -109,6 +109,10 @@ class Reason(IntEnum):
         "of that time would make it: the clock jumped, or the load was off. Correct the times, or give the rest as samples of "
         "no current."
     )
+    MISSED = (
+        "Between {since_s:.0f} s and {fault_s:.0f} s the voltage steps by what {size:.0f} C make: rows are missing together "
+        "with their time, or a charge is, that flowed and was not measured. Export all rows, with the clock of the tester."
+    )
     # what was given does not suffice
     EMPTY = "The model cell is empty before the record ends: its q_max is too small for this record."
     FEW = "These are too few {of} to tell the noise. Record on or more often{or_else}."
@@ -166,6 +170,10 @@ class Reason(IntEnum):
     UNCOUNTED = (
         "The tester counted another charge than current and time make, its clock starts anew with each step, or currents are "
         "missing: {uncounted_C:.0f} C are in doubt. Check units and clock, and export the time since the start of the test.",
+        "q_mobile",
+    )
+    MISSED_UNSURE = (
+        "The voltage steps between two samples by what {missed_C:.0f} C make, under a steady load: so many are in doubt.",
         "q_mobile",
     )
     Q_DROPPED = _DROPPED.format("{dropped_C:.0f} C are"), "q_mobile"

@@ -16,6 +16,7 @@ from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, EQUILIBRI
 from battery_env.electrochemistry.cell import BULK_RATE, SURFACE_RATE, CellParameters
 from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
+from battery_env.estimators.error import ErrorModel, VoltageError
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import Record, Samples, check_drawn_charge, drawn_charge_C
 from battery_env.records.model import RecordModel
@@ -90,6 +91,11 @@ class OnGrid:
         same = len(self.time_s) == len(self.grid_s)
         return same and np.allclose(self.time_s, self.grid_s, rtol=0.0, atol=1e-6 * self.dt_s)
 
+    @cached_property
+    def samples_A(self) -> FloatArray:
+        """The current at the samples, A."""
+        return self.at_samples([self.current_A])[0]
+
     def at_samples(self, columns: Iterable[FloatArray]) -> list[FloatArray]:
         """Columns of the grid, at the samples."""
         if self._samples_are_the_grid:
@@ -103,12 +109,12 @@ class Prior:
 
     name: str
     mean: float
-    weight_V: float  # per unit of the unknown
+    weight: float  # per unit of the unknown, as residuals are weighed
 
     def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """The residual, and its derivatives by all unknowns."""
-        row = np.array([[self.weight_V if name == self.name else 0.0 for name in unknown]])
-        return np.array([self.weight_V * (values[self.name] - self.mean)]), row
+        row = np.array([[self.weight if name == self.name else 0.0 for name in unknown]])
+        return np.array([self.weight * (values[self.name] - self.mean)]), row
 
 
 @dataclass(frozen=True)
@@ -117,7 +123,7 @@ class JointPrior:
 
     names: tuple[str, ...]
     mean: FloatArray
-    rows_V: FloatArray  # of the residuals, by the unknowns
+    rows: FloatArray  # of the residuals, by the unknowns
 
     def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """The residuals, and their derivatives by all unknowns."""
@@ -129,8 +135,8 @@ class JointPrior:
         columns = {name: n for n, name in enumerate(self.names)}
         for n, name in enumerate(unknown):
             if name in columns:
-                by_unknown[:, n] = self.rows_V[:, columns[name]] * slopes[columns[name]]
-        return self.rows_V @ (x - self.mean), by_unknown
+                by_unknown[:, n] = self.rows[:, columns[name]] * slopes[columns[name]]
+        return self.rows @ (x - self.mean), by_unknown
 
 
 @dataclass(frozen=True)
@@ -138,9 +144,9 @@ class Fit:
     """What a search has found."""
 
     values: dict[str, float]  # of all unknowns, and of what is held
-    jacobian: FloatArray  # of all residuals, those of priors included, by the unknowns
+    jacobian: FloatArray  # of all residuals as they are weighed, those of priors included, by the unknowns
     residual_V: FloatArray  # at the samples
-    square_V2: float  # of all residuals
+    square: float  # of all residuals as they are weighed
     at_bound: tuple[str, ...]  # which parameters are
 
 
@@ -157,6 +163,7 @@ class Search:
     bounds: Mapping[str, tuple[float, float]]  # of both parameters; q_mobile is above its least value
     data: OnGrid
     least_q_C: float  # below it the model cell is empty before the record ends
+    error: ErrorModel = ErrorModel()  # by which residuals are weighed; of 1 V: they stay as they are
 
     @classmethod
     def of(
@@ -180,7 +187,7 @@ class Search:
                 "q_mobile_bounds_C (command line: --cell, with a fit of such a cell), or check that time is in s and current "
                 "in A."
             )
-        return cls(model, parameters, nuisance, {**bounds, "q_mobile": (low_C, high_C)}, data, least_q_C)
+        return cls(model, parameters, nuisance, bounds, data, least_q_C)
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -212,59 +219,70 @@ class Search:
             stride = 1
         points = len(data.current_A) // stride
         current_A = data.current_A[: points * stride].reshape(points, stride).mean(axis=1)
-        voltage_V = np.interp(stride * data.dt_s * np.arange(points), data.time_s, data.voltage_V)
-        starts, squares_V2 = [], []
+        time_s = stride * data.dt_s * np.arange(points)
+        voltage_V = np.interp(time_s, data.time_s, data.voltage_V)
+        starts, squares = [], []
         for candidate in q_candidates:
             q_mobile, r_o = candidate, cell.r_o
             if "q_mobile" in self.parameters:
-                q_mobile = _within(q_mobile, self.bounds["q_mobile"])
+                low_C, high_C = self.bounds["q_mobile"]
+                q_mobile = _within(q_mobile, (max(low_C, (1.0 + MARGIN) * self.least_q_C), high_C))
             model_V, _, by_r_o_A = self.model.sensitivities(current_A, q_mobile, r_o, stride)
-            residual_V = model_V - voltage_V
+            error = self.error.along(time_s, current_A, q_mobile)
+            residual, by_r_o = error.whitened(np.column_stack([model_V - voltage_V, by_r_o_A])).T
             if "r_o" in self.parameters:
-                best_ohm = _within(r_o - float(residual_V @ by_r_o_A) / square(by_r_o_A), self.bounds["r_o"])
-                residual_V += (best_ohm - r_o) * by_r_o_A
+                best_ohm = _within(r_o - float(residual @ by_r_o) / square(by_r_o), self.bounds["r_o"])
+                residual = residual + (best_ohm - r_o) * by_r_o
                 r_o = best_ohm
-            square_V2 = square(residual_V)
             starts.append({"q_mobile": q_mobile, "r_o": r_o})
             # on the coarse grid a cell may be empty a little too early
-            squares_V2.append(inf if isnan(square_V2) else square_V2)
-        return starts, np.array(squares_V2)
+            squares.append(inf if isnan(square(residual)) else square(residual))
+        return starts, np.array(squares)
 
     def best_starts(self, more_q_C: Sequence[float]) -> list[dict[str, float]]:
         """Return the local minima on a grid of ``q_mobile``, refined where promising, that may lead to the global one."""
         excess = _START_EXCESS
-        coarse, coarse_V2 = self.starts((self.least_q_C * (1.0 + excess)).tolist())
-        promising = _is_near_best(coarse_V2)
+        coarse, coarse_squares = self.starts((self.least_q_C * (1.0 + excess)).tolist())
+        promising = _is_near_best(coarse_squares)
         left = np.flatnonzero(promising[:-1] | promising[1:])
         between = excess[left, None] * (excess[left + 1] / excess[left])[:, None] ** (np.arange(1, _FINER) / _FINER)
-        finer, finer_V2 = self.starts([*(self.least_q_C * (1.0 + between.ravel())).tolist(), *more_q_C])
-        starts, squares_V2 = [*coarse, *finer], np.append(coarse_V2, finer_V2)
+        finer, finer_squares = self.starts([*(self.least_q_C * (1.0 + between.ravel())).tolist(), *more_q_C])
+        starts, squares = [*coarse, *finer], np.append(coarse_squares, finer_squares)
         order = np.argsort([start["q_mobile"] for start in starts], kind="stable")
-        squares_V2 = squares_V2[order]
-        beside_V2 = np.pad(squares_V2, 1, constant_values=np.inf)
-        minima = (squares_V2 <= beside_V2[:-2]) & (squares_V2 < beside_V2[2:]) & _is_near_best(squares_V2)
-        return [starts[order[n]] for n in np.union1d(np.flatnonzero(minima), squares_V2.argmin())]
+        squares = squares[order]
+        beside = np.pad(squares, 1, constant_values=np.inf)
+        minima = (squares <= beside[:-2]) & (squares < beside[2:]) & _is_near_best(squares)
+        return [starts[order[n]] for n in np.union1d(np.flatnonzero(minima), squares.argmin())]
 
     def best(self, starts: Sequence[dict[str, float]], priors: Sequence[Prior | JointPrior]) -> Fit:
         """Return the best fit that is found from any of the starts."""
-        return min((self._fit(start, priors) for start in starts), key=lambda fit: fit.square_V2)
+        return min((self._fit(start, priors) for start in starts), key=lambda fit: fit.square)
 
     def _fit(self, start: dict[str, float], priors: Sequence[Prior | JointPrior]) -> Fit:
         free, values = list(self.unknown), dict.fromkeys(self.nuisance, 0.0) | start
-        bounds = {**dict.fromkeys(RATE_CONSTANTS, (-_REACH, _REACH)), **self.bounds}
+        error = self.error.along(self.data.time_s, self.data.samples_A, start["q_mobile"])
         while True:
-            values = self._minimized(values, free, priors)
+            values = self._minimized(values, free, priors, error)
+            bounds = self._bounds_at(values)
             clipped = {name: _within(values[name], bounds[name]) for name in free if name in bounds}
             inside = [name for name in free if clipped.get(name, values[name]) == values[name]]
             values = values | clipped
             if len(inside) in (0, len(free)):
                 break
             free = inside
-        residual_V, jacobian = self.residual(values, priors)
-        at_bound = tuple(name for name in self.parameters if values[name] in self.bounds[name])
-        return Fit(values, jacobian, residual_V[: len(self.data.time_s)], square(residual_V), at_bound)
+        residual, jacobian = self.weighed(values, priors, error)
+        at_bound = tuple(name for name in self.parameters if values[name] in self._bounds_at(values)[name])
+        return Fit(values, jacobian, self.residual(values)[0], square(residual), at_bound)
 
-    def _minimized(self, start: dict[str, float], free: list[str], priors: Sequence[Prior | JointPrior]) -> dict[str, float]:
+    def _bounds_at(self, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """Of all that has any; how slow the diffusion is moves the least ``q_mobile``."""
+        (low_C, high_C), least_C = self.bounds["q_mobile"], self.least_q_at_C(values)[0]
+        of_q_C = (max(low_C, (1.0 + MARGIN) * least_C), high_C)
+        return {**dict.fromkeys(RATE_CONSTANTS, (-_REACH, _REACH)), **self.bounds, "q_mobile": of_q_C}
+
+    def _minimized(
+        self, start: dict[str, float], free: list[str], priors: Sequence[Prior | JointPrior], error: VoltageError
+    ) -> dict[str, float]:
         unknown = self.unknown
         columns = [unknown.index(name) for name in free]
 
@@ -277,12 +295,12 @@ class Search:
 
         def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
             values, least_C, least_by_log_C = values_at(x)
-            residual_V, by_unknown = self.residual(values, priors)
+            residual, by_unknown = self.weighed(values, priors, error)
             slopes = [values[name] - least_C if name == "q_mobile" else 1.0 for name in free]
             by_x = by_unknown[:, columns] * slopes
             if "q_mobile" in free and "tDiffusion" in free:  # which moves q_mobile along with its least value
                 by_x[:, free.index("tDiffusion")] += least_by_log_C * by_unknown[:, unknown.index("q_mobile")]
-            return residual_V, by_x
+            return residual, by_x
 
         least_C, _ = self.least_q_at_C(start)
         x = minimized(
@@ -294,10 +312,20 @@ class Search:
         )
         return values_at(x)[0]
 
-    def residual(
-        self, values: Mapping[str, float], priors: Sequence[Prior | JointPrior] = ()
+    def weighed(
+        self, values: Mapping[str, float], priors: Sequence[Prior | JointPrior], error: VoltageError
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals at the samples, V, with one more for each prior, and their derivatives by all unknowns."""
+        """Return the residuals as an error weighs them, with one more for each prior, and their derivatives by all unknowns."""
+        residual_V, jacobian_V = self.residual(values)
+        rows = error.whitened(np.column_stack([residual_V, jacobian_V]))
+        residual, jacobian = rows[:, 0], rows[:, 1:]
+        for prior in priors:
+            known, by_unknown = prior.residual(values, self.unknown)
+            residual, jacobian = np.append(residual, known), np.vstack([jacobian, by_unknown])
+        return residual, jacobian
+
+    def residual(self, values: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+        """Return the residuals at the samples, V, and their derivatives by all unknowns."""
         q_mobile, r_o = values["q_mobile"], values["r_o"]
         if self.nuisance:
             model_V, slopes, fraction_p = self.model_at(values).tangents(self.data.current_A, q_mobile, r_o)
@@ -309,24 +337,18 @@ class Search:
             model_V, *both = self.model.sensitivities(self.data.current_A, q_mobile, r_o)
             by_name = dict(zip(PARAMETER_NAMES, both, strict=True))
         seen_V, *columns = self.data.at_samples([model_V, *(by_name[name] for name in self.unknown)])
-        residual_V, jacobian = seen_V - self.data.voltage_V, np.column_stack(columns)
-        for prior in priors:
-            known_V, rows = prior.residual(values, self.unknown)
-            residual_V, jacobian = np.append(residual_V, known_V), np.vstack([jacobian, rows])
-        return residual_V, jacobian
+        return seen_V - self.data.voltage_V, np.column_stack(columns)
 
     def model_at(self, values: Mapping[str, float]) -> RecordModel:
         """Return the model with the nuisance constants at some values."""
-        cell, constants = self.model.cell, {}
+        cell = self.model.cell
+        constants = {}
         for name in self.nuisance.keys() & set(RATE_CONSTANTS):
             # a step of the search may go far, but explicit Euler is stable only for rates below 2 / dt
             constant = getattr(cell, name) * float(np.exp(_within(values[name], (-_REACH, _REACH))))
             constants[name] = max(constant, self._least_stable(name))
-        if constants:
-            cell = cell.replace(**constants)
-        if self._has_equilibrium:
-            cell = with_equilibrium(cell, [values[name] for name in EQUILIBRIUM_NAMES])
-        return self.model if cell is self.model.cell else self.model.of_cell(cell)
+        added_V = tuple(values[name] for name in EQUILIBRIUM_NAMES) if self._has_equilibrium else ()
+        return _with_constants(self.model, tuple(constants.items()), added_V)
 
     @property
     def _has_equilibrium(self) -> bool:
@@ -343,6 +365,17 @@ class Search:
         if "tDiffusion" not in self.nuisance:
             return self.least_q_C, 0.0
         return self.model_at(values).least_q_mobile_tangent_C(self.data.current_A)
+
+
+@lru_cache(maxsize=4)  # it is asked for several times at each step of a search
+def _with_constants(model: RecordModel, rates: tuple[tuple[str, float], ...], added_V: tuple[float, ...]) -> RecordModel:
+    """A model with other rates, and with what is added to the equilibrium voltage."""
+    cell = model.cell
+    if rates:
+        cell = cell.replace(**dict(rates))
+    if added_V:
+        cell = with_equilibrium(cell, list(added_V))
+    return model if cell is model.cell else model.of_cell(cell)
 
 
 def _diffusion_rate(cell: CellParameters) -> float:
@@ -364,5 +397,5 @@ def _within(value: float, limits: tuple[float, float]) -> float:
     return min(max(value, limits[0]), limits[1])
 
 
-def _is_near_best(squares_V2: FloatArray) -> BoolArray:
-    return np.asarray(squares_V2 <= _RIVAL_RATIO * squares_V2.min())
+def _is_near_best(squares: FloatArray) -> BoolArray:
+    return np.asarray(squares <= _RIVAL_RATIO * squares.min())

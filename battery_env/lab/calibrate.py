@@ -20,7 +20,6 @@ from typing_extensions import Unpack
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.electrochemistry import NEW_CELL, CellParameters
-from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.cell import TB
 from battery_env.electrochemistry.ends import quantile
 from battery_env.estimates import Estimate, last_estimate
@@ -251,7 +250,7 @@ def _estimate(
     if doubt := part.start.reason or settings.other_load(mean_current_A(part.record)):
         # of the charge: the resistance, which is settled within 30 %, is not in question
         estimate = replace(estimate, settled_q_mobile=False, reason=" ".join(filter(None, [estimate.reason, doubt])))
-    model = RecordModel(cell_with(cell, estimate.constants), thermal, initial_soc=part.start.soc)
+    model = RecordModel(cell, thermal, initial_soc=part.start.soc)
     return estimate, method, model, now
 
 

@@ -13,6 +13,7 @@ from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_not_negative, check_positive, check_whole_number
 from battery_env.electrochemistry import NEW_CELL, voltage
 from battery_env.electrochemistry.ends import BAND, Cells, Ends, follow, quantile, run_down
+from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.estimates import Estimate
 from battery_env.estimators.estimator import ModelNow
 from battery_env.estimators.reasons import is_only_imprecise
@@ -22,9 +23,6 @@ from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records import CUT_OFF_V, Record, Samples, check_record, expected_current
 from battery_env.records.model import RECENT_SHARE, RecordModel
 
-#: The error of the model is this many times ``mismatch_V`` before ``q_mobile`` and ``r_o`` absorb their shares, which come out
-#: under another load: with those that ``fit_cell`` finds of B0005 a new 18650's constants miss its voltage by 81 to 102 mV.
-WHOLE_ERROR = 2.0
 # The course of the voltage is kept about this often, s.
 _COURSE_S = 10.0
 # The last voltage of a record may be the cut-off but for rounding, V.
@@ -198,11 +196,12 @@ def forecast(
     cut_off = model.cell.VEOD if cut_off_V is None else cut_off_V
     _check_arguments(mismatch_V, cut_off, nominal_Ah, samples, seed)
     seen = check_record(record, least_samples=2)
-    rng = np.random.default_rng(seed)
+    rng, new = np.random.default_rng(seed), model
     ahead, load_name = _to_come(load, load_unit, seen, model)
     notes = _notes(estimate, seen, load is None and isinstance(ahead, RandomLoad))
 
     if now is None:
+        model = model.at(estimate)
         _, current_A = model.grid(seen)
         q_C, r_ohm, acting_ohm = _draw_parameters(model, current_A[:-1], estimate, mismatch_V, samples, rng)
         cells, voltage_V = _at_the_end_of(seen, model, current_A, (q_C, acting_ohm), mismatch_V, rng)
@@ -234,7 +233,7 @@ def forecast(
         ends = run_down(cells, model, draws[-samples:], cut_off, _COURSE_S)
     if nominal_Ah is None:
         # the mean over loads: under a single draw, health would be a matter of that draw. No charge takes a cell to its end
-        given_Ah = model.capacity_Ah(draws[:_NOMINAL_DRAWS], cut_off)
+        given_Ah = new.capacity_Ah(draws[:_NOMINAL_DRAWS], cut_off)
         nominal_Ah = float(given_Ah[given_Ah > 0.0].mean()) if (given_Ah > 0.0).any() else float("nan")
     return Forecast(
         record=seen,

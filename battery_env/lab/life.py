@@ -18,11 +18,10 @@ from scipy.optimize import minimize
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
-from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.ends import BAND, quantile
+from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import is_only_imprecise
-from battery_env.lab.forecast import WHOLE_ERROR
 from battery_env.loads import Load, LoadToCome
 from battery_env.records import VARIED_SHARE, drawn, mean_current_A
 from battery_env.records.discharge import Discharge
@@ -194,8 +193,7 @@ def _row_of(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) ->
     """What one discharge says alone."""
     record = discharge.loaded_part(cut_off_V)
     estimate = calibrator.estimate(record)
-    model = calibrator.model.of_cell(cell_with(calibrator.model.cell, estimate.constants))
-    end_s = model.forecast(record, estimate, cut_off_V).eod_time_s
+    end_s = calibrator.model.forecast(record, estimate, cut_off_V).eod_time_s
     capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
     return {

@@ -209,7 +209,8 @@ def _read_life(arguments: Sequence[str], running: Source, file_format: FileForma
 
 def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
     """The life of a cell, by whole discharges that are looked at as the next one is."""
-    calibrator = replace(settings, method="least-squares", initial_soc=1.0).calibrator()
+    # all of them have the same constants, whatever these are
+    calibrator = replace(settings, method="least-squares", initial_soc=1.0, cell_rates_sd={}).calibrator()
     assert isinstance(calibrator, LeastSquares)
     return track_life(discharges, settings.cut_off_V, calibrator)
 

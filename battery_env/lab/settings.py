@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypedDict, get_args
 
@@ -14,7 +14,8 @@ from battery_env.checks import check_positive
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
-from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V, CellFit, read_cell
+from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.estimators.cell_fit import RATE_PRIOR_SD, SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.kalman.filter import PRIOR_SD_SHARE_Q, ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
@@ -91,7 +92,10 @@ class Settings:
         quarter no estimate is settled, and no nominal capacity is told. ``None``: they hold for all
     :param cell_q_mobile_C: between which ``q_mobile`` a cell with these constants has over its life, C: what the end of a
         discharge in progress keeps to, of which no prior is known. ``None``: that is not known
-    :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``, ohm
+    :param cell_rates_sd: how well the rate constants of ``cell`` are known: standard deviations of their logarithms, by name,
+        for least squares. ``None``: those of a new 18650 as any cell of any kind may differ from them
+        (:data:`battery_env.estimators.cell_fit.RATE_PRIOR_SD`), and stated ones as cells of a kind do
+    :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``, ohm, for the filter
     :param path: how cells of this kind age, which least squares take for a prior; :meth:`for_cell` sets what goes with it
     :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
@@ -112,6 +116,7 @@ class Settings:
     cell: CellParameters | None = None
     cell_currents_A: tuple[float, float] | None = None
     cell_q_mobile_C: tuple[float, float] | None = None
+    cell_rates_sd: Mapping[str, float] | None = None
     cell_sd_r_o_ohm: float = 0.0
     path: AgingPath | None = None
     q_mobile_bounds_C: tuple[float, float] | None = None
@@ -158,6 +163,7 @@ class Settings:
                 "cell_currents_A": cell.currents_A,
                 "cell_q_mobile_C": cell.life_q_mobile_C,
                 "q_mobile_bounds_C": cell.q_mobile_bounds_C,
+                "cell_rates_sd": cell.rates_sd,
                 "cell_sd_r_o_ohm": cell.sd_r_o_ohm,
             }
             others, cell = {**known, **others}, cell.cell
@@ -223,16 +229,32 @@ class Settings:
         """
         if self.method == "policy":
             return PolicyEstimator.pretrained(recorded=True)
-        calibrator = ExtendedKalmanFilter if self.method == "kalman" else partial(LeastSquares, path=self.path)
         stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
-        return calibrator(
-            self.parameters,
-            cell or self.cell or NEW_CELL,
-            thermal=self.thermal,
-            prior_q_mobile_C=self.prior_q_mobile_C,
-            mismatch_V=self.mismatch_V,
-            current_gain_sd=self.current_gain_sd,
-            cell_sd_r_o_ohm=self.cell_sd_r_o_ohm,
-            initial_soc=stated if start is None else (start.soc, start.sd_soc),
-            q_mobile_bounds_C=Q_MOBILE.limits if self.q_mobile_bounds_C is None else self.q_mobile_bounds_C,
-        )
+        common: dict[str, Any] = {
+            "parameters": self.parameters,
+            "cell": cell or self.cell or NEW_CELL,
+            "thermal": self.thermal,
+            "prior_q_mobile_C": self.prior_q_mobile_C,
+            "current_gain_sd": self.current_gain_sd,
+            "initial_soc": stated if start is None else (start.soc, start.sd_soc),
+            "q_mobile_bounds_C": Q_MOBILE.limits if self.q_mobile_bounds_C is None else self.q_mobile_bounds_C,
+        }
+        if self.method == "kalman":
+            return ExtendedKalmanFilter(mismatch_V=self.mismatch_V, cell_sd_r_o_ohm=self.cell_sd_r_o_ohm, **common)
+        rates_sd = self._rates_sd()
+        # constants that are anybody's, once they are free, explain as much of the error as q_mobile and r_o absorb
+        is_explained = rates_sd is RATE_PRIOR_SD
+        mismatch_V = self.mismatch_V / WHOLE_ERROR if is_explained else self.mismatch_V
+        nuisance = {name: sd for name, sd in rates_sd.items() if name != "tDiffusion" or "q_mobile" in self.parameters}
+        return LeastSquares(mismatch_V=mismatch_V, nuisance=nuisance, path=self.path, **common)
+
+    def _rates_sd(self) -> Mapping[str, float]:
+        """
+        How well the rate constants are known, that are searched for beside both parameters: all that least squares are not
+        told. A path tells them, and the prior of a life is for the constants as they are.
+        """
+        if self.path is not None or self.prior_q_mobile_C is not None:
+            return {}
+        if self.cell_rates_sd is not None:
+            return self.cell_rates_sd
+        return RATE_PRIOR_SD if self.cell is None else dict.fromkeys(RATE_PRIOR_SD, SAME_KIND_SD)

@@ -25,6 +25,7 @@ from battery_env.electrochemistry import (
     rest_shares,
     simulate,
 )
+from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.ends import LONGEST_S, Cells, ToCome, run_down
 from battery_env.electrochemistry.tangents import TANGENT_NAMES, PolynomialDerivatives, least_q_mobile, roll_out_with_tangents
 from battery_env.estimates import Estimate
@@ -154,6 +155,10 @@ class RecordModel:
         check_dt(self.dt_s, cell)
         return model
 
+    def at(self, estimate: Estimate) -> RecordModel:
+        """The same model with the constants that were found beside an estimate, if there are any."""
+        return self if estimate.constants is None else self.of_cell(cell_with(self.cell, estimate.constants))
+
     def grid(self, record: Record) -> tuple[FloatArray, FloatArray]:
         """
         A record on the time grid of the model, which starts at the first sample.
@@ -204,12 +209,12 @@ class RecordModel:
         The voltage of the model at the samples of a record, under its current.
 
         :param record: one discharge
-        :param at: the parameters
+        :param at: the parameters, with constants that were found beside them
         :return: voltage in V, shape (T,); NaN after the model cell is empty
         :raises ValueError: for parameters out of range, or a record that cannot be used
         """
         time_s, current_A = self.grid(record)
-        return _at(time_s, self.simulate(current_A, at.q_mobile, at.r_o))
+        return _at(time_s, self.at(at).simulate(current_A, at.q_mobile, at.r_o))
 
     def forecast(
         self,
@@ -241,7 +246,7 @@ class RecordModel:
             # no cell of this q_mobile lasts longer than this, whatever it had delivered before
             steps = int(at.q_mobile / (future_current_A * self.dt_s)) + 1
             current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
-        simulation, start_s = self.simulate(current_A, at.q_mobile, at.r_o), float(record.time_s[0])
+        simulation, start_s = self.at(at).simulate(current_A, at.q_mobile, at.r_o), float(record.time_s[0])
         return VoltageForecast(
             replace(simulation, time_s=start_s + simulation.time_s, eod_time_s=start_s + simulation.eod_time_s),
             self.cell.VEOD if cut_off_V is None else cut_off_V,

@@ -11,6 +11,7 @@ from numpy.polynomial import Legendre
 from battery_env import CellParameters, ExtendedKalmanFilter, LeastSquares, fit_cell, forecast
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.equilibrium import with_equilibrium
+from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, CellFit, read_cell
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, JointFit
@@ -178,7 +179,7 @@ class TestRealCells:
         for discharge in load_nasa_discharges("B0006")[8::40]:
             record = discharge.loaded_part(2.7)
             error_V = own.model.voltage(record, own.estimate(record)) - record.voltage_V
-            assert np.sqrt(np.mean(error_V**2)) < 1.2 * b0005_fit.mismatch_V
+            assert np.sqrt(np.mean(error_V**2)) < WHOLE_ERROR * b0005_fit.mismatch_V
         assert all(f"{1e3 * error_V:.1f} mV\n" in b0005_fit.summary() + "\n" for error_V in shown_V)
 
     @pytest.mark.parametrize("numbers", sweep([0, 10, 20], [0], [5, 5, 5]), ids=["young", "one", "copies"])
@@ -208,10 +209,9 @@ class TestRealCells:
         record = discharge.loaded_part(2.7).until(0.75 * end_s)
         estimate = calibrator.estimate(record)
         found = forecast(record, estimate, model=calibrator.model, mismatch_V=b0005_fit.mismatch_V)
-        new = forecast(record, LeastSquares(thermal=True, mismatch_V=0.05).estimate(record), cut_off_V=2.7)
         assert found.cut_off_V == 2.7  # that of the fit
         low_s, median_s, high_s = found.eod_quantile_s()
-        assert low_s < end_s < high_s and abs(median_s - end_s) < 0.5 * abs(new.eod_quantile_s(0.5) - end_s)
+        assert low_s < end_s < high_s and median_s == pytest.approx(end_s, rel=0.08)
         assert 1.7 < found.nominal_Ah < 1.95  # the first discharge that was fitted gave 1.86 Ah
         loads = [constant_load(record.current_A[-1], "current")]
         assert found.nominal_Ah == pytest.approx(calibrator.model.capacity_Ah(loads, 2.7)[0])

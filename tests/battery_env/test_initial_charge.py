@@ -98,7 +98,8 @@ class TestCommandLine:
     def test_a_stated_charge(self, method, record, tmp_path, capsys):
         options = ["--method", method, "--mismatch", "0.02", "--nominal", "2"]
         status, row = self.row(record, tmp_path, capsys, *options, "--initial-soc", "0.8")
-        assert status == SETTLED and row["initial_soc"] == 0.8 and row["q_mobile_C"] == pytest.approx(6000.0, rel=0.02)
+        assert status == (SETTLED if method == "kalman" else NOT_SETTLED) and row["initial_soc"] == 0.8
+        assert row["q_mobile_C"] == pytest.approx(6000.0, rel=0.02)
         # the capacity is that of a full cell
         full = RecordModel(NEW_CELL.replace(q_mobile=6000.0, r_o=0.15), thermal=True)
         (full,) = full.capacity_Ah([constant(2.0, "current")], 2.8)

@@ -561,7 +561,7 @@ class TestCountedByTheTester:
         assert discharge.history.uncounted_C == pytest.approx(abs(gain - 1.0) * charge_C, rel=0.1)
         for method in ("least-squares", "kalman"):
             found = calibrate(discharge, method=method)
-            assert found.sd_q_mobile_C > discharge.history.uncounted_C and not found.settled_q_mobile
+            assert found.sd_q_mobile_C > 0.95 * discharge.history.uncounted_C and not found.settled_q_mobile
             assert "The tester counted another charge" in found.reason
             assert found.sd_predicted_capacity_Ah > discharge.history.uncounted_C / 3600.0
 

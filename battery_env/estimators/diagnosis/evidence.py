@@ -16,7 +16,7 @@ from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
-from battery_env.estimators.diagnosis.faults import KEPT, Row, find, middle, noise_V, table
+from battery_env.estimators.diagnosis.faults import KEPT, NOISES, RESOLUTION_V, SMOOTHED_SHARE, Row, find, middle, noise_V, table
 from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, LACKING_SHARE, low_rest_voltage_V, rest_voltage_V
 from battery_env.estimators.reasons import MOST_OF_SD, SETTLED_SHARES, Reason
 from battery_env.records import LOAD_SHARE, REST_CURRENT_A, STEADY_S, SWITCH_SHARE, ChargeBefore, ChargeHistory, Samples
@@ -37,6 +37,8 @@ _RISE_V = 0.05
 _LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
 # A cell from which this share of its charge was drawn does not come back to the voltage of its first sample without a charge.
 _RECOVERY_SHARE = 0.2
+# A change of the voltage is compared with so many before and behind it.
+_BESIDE = 5
 # What dropouts of the current, or switches between samples, make of the charge speaks against both numbers where an estimate
 # of it would not be settled.
 _MOST_SHARE = SETTLED_SHARES["q_mobile"]
@@ -77,7 +79,7 @@ _SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V before_oh
 _RING = table(
     [
         *(("n_kept", "i8"), ("time_s", "f8", KEPT), ("voltage_V", "f8", KEPT), ("current_A", "f8", KEPT)),
-        *(("n_changes", "i8"), ("change_V", "f8", KEPT)),
+        *(("n_changes", "i8"), ("change_V", "f8", KEPT), ("interval_s", "f8", KEPT)),
     ]
 )
 
@@ -108,6 +110,7 @@ EVIDENCE = table(
         ("is_counted", "b1"),  # by the tester, which saw what lies between samples
         ("uncounted_C", "f8"),  # by how much it counted another charge
         ("left_C", "f8"),  # what a charge before had left to take
+        ("missed_C", "f8"),  # charge that steps of the voltage show, and the current does not
         ("dropped_C", "f8"),  # charge of switches that were taken back, which it did not follow
         ("dropped_ohm", "f8"),  # by how much they moved an estimate of r_o
         ("fault", _FAULT),
@@ -183,6 +186,7 @@ def measured(evidence: Any, initial_soc: float, clock_s: float = 0.0, charge: Ch
         "switches": evidence["switches"]["count"],
         "uncounted_C": evidence["uncounted_C"],
         "left_C": evidence["left_C"],
+        "missed_C": evidence["missed_C"],
         "dropped_C": evidence["dropped_C"],
         "dropped_mohm": 1e3 * evidence["dropped_ohm"],
         "gap_start_s": end_s - gap["length_s"],
@@ -226,10 +230,12 @@ def examine(evidence: Row, voltage: float, current: float, q_mobile: float, r_o:
     if evidence.samples > 1 and not isnan(voltage):
         before, ring = evidence.before, evidence.ring
         ring.change_V[ring.n_changes % KEPT] = voltage - before.voltage_1_V
+        ring.interval_s[ring.n_changes % KEPT] = evidence.time_s - before.time_1_s
         ring.n_changes += 1
         middle_V = middle(before.voltage_2_V, before.voltage_1_V, voltage)
         resistance_ohm = _least_resistance_ohm(evidence.start, q_mobile, r_o)
         _examine_last(evidence, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile), r_o)
+        _look_for_missed(evidence, current, q_mobile)
         switch = evidence.switch
         lowest_V, highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
         is_pending = switch.size_A != 0.0 and evidence.fault.reason == 0
@@ -275,7 +281,8 @@ def unseen_C(evidence: Row) -> float:
     rest = evidence.rest
     beside_C = hypot(rest.load_on_C, rest.mean_A * (evidence.time_s - rest.over_s)) if rest.is_over else 0.0
     between_C = hypot(gaps.doubtful_C(evidence), 0.0 if evidence.is_counted else switched_C(evidence.switches))
-    return hypot(hypot(hypot(beside_C, evidence.uncounted_C), hypot(between_C, evidence.dropped_C)), evidence.left_C)
+    missed_C = hypot(evidence.missed_C, evidence.dropped_C)
+    return hypot(hypot(hypot(beside_C, evidence.uncounted_C), hypot(between_C, missed_C)), evidence.left_C)
 
 
 @compiled
@@ -296,6 +303,8 @@ def doubt_reason(evidence: Row, sd_C: float) -> int:
         return Reason.TAPERED_EARLY + 0
     if evidence.uncounted_C > most_C:
         return Reason.UNCOUNTED + 0
+    if evidence.missed_C > most_C:
+        return Reason.MISSED_UNSURE + 0
     if evidence.dropped_C > most_C:
         return Reason.Q_DROPPED + 0
     if not evidence.is_counted and switched_C(evidence.switches) > most_C:
@@ -430,6 +439,42 @@ def _look_for_rise(evidence: Row, time_s: float, voltage: float, current: float)
         n = ring.n_kept % KEPT
         ring.time_s[n], ring.voltage_V[n], ring.current_A[n] = time_s, voltage, current
         ring.n_kept += 1
+
+
+@compiled
+def _look_for_missed(evidence: Row, current: float, q_mobile: float) -> None:
+    # Under a steady load the voltage changes from sample to sample as it did before and does afterwards, or in proportion to
+    # the time between them. A step beyond that and noise is a charge that rows were lost with, together with their time.
+    ring, count = evidence.ring, 2 * _BESIDE + 1
+    if ring.n_changes < count or current <= REST_CURRENT_A:
+        return
+    change_V, interval_s = np.empty(count), np.empty(count)
+    for k in range(count):
+        n = (ring.n_changes - count + k) % KEPT
+        change_V[k], interval_s[k] = ring.change_V[n], ring.interval_s[n]
+    span_s = interval_s.sum()
+    if evidence.time_s - span_s - evidence.examined.jump_s < STEADY_S:
+        return
+    usual_V, usual_V_per_s = float(np.median(change_V)), float(np.median(change_V / interval_s))
+    by_time_V = usual_V_per_s * interval_s[_BESIDE]
+    low_V, high_V = min(usual_V, by_time_V), max(usual_V, by_time_V)
+    # alone and with either neighbour, which takes a single wild voltage back
+    alone_V = change_V[_BESIDE]
+    pairs_V = alone_V + change_V[_BESIDE - 1] - usual_V, alone_V + change_V[_BESIDE + 1] - usual_V
+    step_V = 0.0
+    if max(alone_V, pairs_V[0], pairs_V[1]) < low_V:
+        step_V = low_V - max(alone_V, pairs_V[0], pairs_V[1])
+    elif min(alone_V, pairs_V[0], pairs_V[1]) > high_V:
+        step_V = high_V - min(alone_V, pairs_V[0], pairs_V[1])
+    noise_of_change_V = max(sqrt(2.0) / SMOOTHED_SHARE * noise_V(evidence), NOISES * RESOLUTION_V)
+    if abs(step_V) <= noise_of_change_V:
+        return
+    fall_V_per_s = max(-float(change_V.sum() - alone_V) / (span_s - interval_s[_BESIDE]), RESOLUTION_V / span_s)
+    missed_C = current * step_V / fall_V_per_s
+    evidence.missed_C = hypot(evidence.missed_C, missed_C)
+    if evidence.missed_C > _MOST_SHARE * q_mobile:
+        step_s = evidence.time_s - interval_s[_BESIDE + 1 :].sum()
+        find(evidence, Reason.MISSED, step_s, step_s - interval_s[_BESIDE], evidence.missed_C)
 
 
 @compiled
