@@ -61,6 +61,7 @@ class SettingsOptions(TypedDict, total=False):
     cell: CellFit | AgingPath | CellParameters | None
     cell_currents_A: tuple[float, float] | None
     cell_q_mobile_C: tuple[float, float] | None
+    cell_rates_sd: Mapping[str, float] | None
     cell_sd_r_o_ohm: float
     path: AgingPath | None
     q_mobile_bounds_C: tuple[float, float] | None
