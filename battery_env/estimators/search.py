@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from math import inf, isnan
 from typing import Any
@@ -163,7 +163,8 @@ class Search:
     bounds: Mapping[str, tuple[float, float]]  # of both parameters; q_mobile is above its least value
     data: OnGrid
     least_q_C: float  # below it the model cell is empty before the record ends
-    error: ErrorModel = ErrorModel()  # by which residuals are weighed; of 1 V: they stay as they are
+    # by which residuals are weighed; of 1 V: they stay as they are
+    error: ErrorModel = field(default_factory=ErrorModel)
 
     @classmethod
     def of(
@@ -210,7 +211,7 @@ class Search:
     def starts(self, q_candidates: Sequence[float]) -> tuple[list[dict[str, float]], FloatArray]:
         """
         Compare values of ``q_mobile`` on a coarse grid of time: return each, within its bounds, with the ``r_o`` that goes
-        best with it (the voltage is nearly linear in it), and the sums of squared residuals, V^2.
+        best with it (the voltage is nearly linear in it), and the sums of squared residuals as they are weighed.
         """
         cell, data = self.model.cell, self.data
         # the largest step for which neither a voltage drop nor the diffusion oscillates with explicit Euler
@@ -219,7 +220,7 @@ class Search:
             stride = 1
         points = len(data.current_A) // stride
         current_A = data.current_A[: points * stride].reshape(points, stride).mean(axis=1)
-        time_s = stride * data.dt_s * np.arange(points)
+        time_s = data.grid_s[: points * stride : stride]
         voltage_V = np.interp(time_s, data.time_s, data.voltage_V)
         starts, squares = [], []
         for candidate in q_candidates:
@@ -315,7 +316,7 @@ class Search:
     def weighed(
         self, values: Mapping[str, float], priors: Sequence[Prior | JointPrior], error: VoltageError
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals as an error weighs them, with one more for each prior, and their derivatives by all unknowns."""
+        """Return residuals as an error weighs them, with one more for each prior, and their derivatives by all unknowns."""
         residual_V, jacobian_V = self.residual(values)
         rows = error.whitened(np.column_stack([residual_V, jacobian_V]))
         residual, jacobian = rows[:, 0], rows[:, 1:]

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 import battery_env
-from battery_env import Calibration, Discharge, LeastSquares, PolicyEstimator, Settings, load_nasa_discharges
+from battery_env import Calibration, Discharge, PolicyEstimator, Settings, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.model_error import memory_share
 from battery_env.estimators.cell_fit import read_cell

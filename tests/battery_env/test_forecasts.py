@@ -12,10 +12,10 @@ import pytest
 from battery_env import NEW_CELL, Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
 from battery_env.__main__ import calibrate, main
 from battery_env.electrochemistry.equilibrium import with_equilibrium
+from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.estimates import last_estimate
 from battery_env.estimators import ExtendedKalmanFilter
 from battery_env.lab.calibrate import calibrate as calibrate_record
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.lab.running import forecast_end, read_load
 from battery_env.lab.settings import Settings
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit

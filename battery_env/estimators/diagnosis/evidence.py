@@ -16,7 +16,17 @@ from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
-from battery_env.estimators.diagnosis.faults import KEPT, NOISES, RESOLUTION_V, SMOOTHED_SHARE, Row, find, middle, noise_V, table
+from battery_env.estimators.diagnosis.faults import (
+    KEPT,
+    NOISES,
+    RESOLUTION_V,
+    SMOOTHED_SHARE,
+    Row,
+    find,
+    middle,
+    noise_V,
+    table,
+)
 from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, LACKING_SHARE, low_rest_voltage_V, rest_voltage_V
 from battery_env.estimators.reasons import MOST_OF_SD, SETTLED_SHARES, Reason
 from battery_env.records import LOAD_SHARE, REST_CURRENT_A, STEADY_S, SWITCH_SHARE, ChargeBefore, ChargeHistory, Samples
