@@ -84,37 +84,21 @@ class LeastSquares(Estimator):
     to it, in which the knee of a discharge is nearly straight. It is Levenberg-Marquardt's (MINPACK's) with exact derivatives,
     from the best of several starts on a coarse grid of time. A parameter that leaves its bounds is held there.
 
-    *Standard deviations.* The covariance is (s^2 + n m^2) (J^T J)^-1: J is the Jacobian of the n simulated voltages, s^2 the
-    variance of the residuals, or of ``voltage_noise_V`` where it is stated, m ``mismatch_V``. With m = 0 this holds for white
-    residuals, as of simulated records with noise. On a real cell the residuals are the model's error, which is far from white
-    and which a fit of half a discharge hides in its parameters: the white formula then claims 1 % where the estimate is 40 %
-    off. There set ``mismatch_V`` to the error expected of the model (0.05 V for the cells that come with the package): it
-    counts as one error common to the record, which more samples do not make smaller. The gain of the current sensor scales
-    both parameters and does not show in the voltage: state it as ``current_gain_sd``.
+    *Standard deviations* follow from one likelihood (:mod:`~battery_env.estimators.error`). With ``mismatch_V`` of 0 the
+    residuals are white, as of simulated records with noise. On a real cell they are the model's error, which a fit of half a
+    discharge hides in its parameters. So an error of twice ``mismatch_V``, the error expected of the model, drifts along the
+    charge drawn, beside white noise. More samples do not average it out. The gain of the current sensor scales both
+    parameters and does not show in the voltage: state it as ``current_gain_sd``.
+
+    *Nuisance constants* are not known exactly, and are estimated along with the parameters, each under a prior of its own; so
+    can be an offset of the voltage sensor. Slow diffusion looks like a smaller ``q_mobile``, and slow kinetics like a larger
+    ``r_o``: what the record does not tell apart is in the standard deviations of the parameters.
 
     *Settled* means that the record alone determines every parameter searched for, with a standard deviation below
-    :data:`~battery_env.estimators.reasons.SETTLED_SHARES` of its value without any prior, and that nothing
-    contradicts it:
-
-    - the record can start with a full cell, or with one of ``initial_soc``, unless ``initial`` is given;
-    - where it was not logged for a while under load (:mod:`~battery_env.estimators.diagnosis.gaps`), the voltage falls by
-      what was drawn meanwhile. If noise hides that, the charge in doubt is in the standard deviation of ``q_mobile``;
-    - each parameter is inside its bounds, ``q_mobile`` is plausible for a cell of this kind, and the model lasts as long as
-      the record;
-    - the residuals are no larger than noise and twice ``mismatch_V`` explain. They are where the sensor has an offset, or
-      where the parameter that is held is wrong;
-    - the voltage follows the current where the load is switched, and does not rise where it is not;
-    - the model comes down to the lowest voltage of the record when the record did, to 2 % of its duration;
-    - a prior is within 2.5 standard deviations of what the record says;
-    - if no noise is stated, there are at least 10 samples more than parameters.
-
-    Otherwise ``reason`` of the estimate says which of these does not hold, the largest doubt first, and ``settled_q_mobile``
-    or ``settled_r_o`` whether one of the numbers is settled all the same. In particular an estimate that rests on a prior is
-    not settled: it is as good as the prior.
-
-    *Nuisance constants.* Constants that are not known exactly can be estimated along with the parameters, each under a prior
-    of its own, and so can an offset of the voltage sensor: where the model is wrong in a known way, that is better than to
-    let the parameters take the blame. Their uncertainty is in the standard deviations of the parameters.
+    :data:`~battery_env.estimators.reasons.SETTLED_SHARES` of its value without any prior, and that nothing contradicts it:
+    the start, gaps and steps of the voltage, its fit, its end, bounds, and a prior. Otherwise ``reason`` of the estimate says
+    which of these does not hold, the largest doubt first, and ``settled_q_mobile`` or ``settled_r_o`` whether one of the
+    numbers is settled all the same. An estimate that rests on a prior is not settled: it is as good as the prior.
 
     *During a discharge*, :meth:`trace` with ``window_every_s`` estimates again and again from all samples so far. Before its
     knee a discharge says little about ``q_mobile``: carry (mean, standard deviation) over from an earlier one as
@@ -130,7 +114,7 @@ class LeastSquares(Estimator):
     :param r_o_bounds_ohm: where to search, ohm
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before this record, C; ``None``: nothing is known
     :param mismatch_V: error to expect of the model itself, V, as above
-    :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: that of the residuals
+    :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: as the record shows it
     :param window_every_s: time between the estimates of :meth:`trace`, s; ``None``: one estimate, at the end
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
     :param nuisance: what else is not known: standard deviations of the logarithms of constants, by name, e.g.
