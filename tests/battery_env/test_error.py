@@ -1,0 +1,59 @@
+"""The error of a voltage, as one likelihood, and what it is for: worn cells, cells in progress, and rows that were lost."""
+
+import numpy as np
+import pytest
+
+from battery_env import NEW_CELL, Discharge, Settings, fit_cell, load_nasa_discharges, simulate
+from battery_env.estimators.error import ErrorModel
+from tests.sweeps import sweep
+
+
+@pytest.mark.parametrize("load", ["constant", "pulses"])
+def test_whitened_errors_are_those_of_the_whole_covariance(load):
+    time_s = np.cumsum(np.random.default_rng(0).uniform(1.0, 20.0, 80))
+    current_A = np.where((load == "pulses") & (time_s % 100.0 < 50.0), 0.2, 2.0)
+    error = ErrorModel(drift_V=0.05, noise_V=0.002, r_o=0.1, to=6.0, load_on_C=100.0).along(time_s, current_A, 6000.0)
+    place = np.cumsum(error.way)
+    covariance = 0.05**2 * np.exp(-np.abs(place[:, None] - place)) + np.diag(error.noise_V**2)
+    rows = np.random.default_rng(1).normal(size=(80, 3))
+    white = error.whitened(rows)
+    np.testing.assert_allclose(white.T @ white, rows.T @ np.linalg.solve(covariance, rows), rtol=1e-9)
+    np.testing.assert_array_equal(ErrorModel(noise_V=0.5).along(time_s, current_A, 6000.0).whitened(rows), rows / 0.5)
+
+
+@pytest.mark.parametrize("slower", sweep(3.0, 0.5, 2.0))
+@pytest.mark.parametrize("kinetics", sweep(0.3, 1.0))
+def test_slow_diffusion_of_a_worn_cell_is_taken_for_neither_charge_nor_resistance(slower, kinetics):
+    cell = NEW_CELL.replace(tDiffusion=slower * NEW_CELL.tDiffusion, kn=kinetics * NEW_CELL.kn)
+    worn = simulate(2.0, 5500.0, 0.13, load_unit="current", thermal=True, cell=cell, cut_off_V=2.7)
+    record = Discharge(worn.time_s[::10], worn.voltage_V[::10], worn.current_A[::10])
+    found = Settings().calibrator().estimate(record)
+    assert abs(found.q_mobile - 5500.0) < 3.0 * found.sd_q_mobile and abs(found.r_o - 0.13) < 3.0 * found.sd_r_o
+
+
+@pytest.mark.parametrize("method", ["least-squares", "kalman"])
+@pytest.mark.parametrize(("cell", "cycle"), sweep(("B0005", 60), ("B0006", 20), ("B0005", 140), ("B0006", 100)))
+@pytest.mark.parametrize("share", sweep(0.4, 0.2, 0.6, 0.8))
+@pytest.mark.parametrize("rows", sweep(10, 20, 40))
+def test_rows_that_are_lost_together_with_their_time_are_seen(method, cell, cycle, share, rows):
+    whole = load_nasa_discharges(cell)[cycle].loaded_part(2.7)
+    first = int(share * len(whole.time_s))
+    kept = np.r_[:first, first + rows : len(whole.time_s)]
+    late_s = np.where(np.arange(len(whole.time_s)) < first, 0.0, whole.time_s[first + rows - 1] - whole.time_s[first - 1])
+    record = Discharge((whole.time_s - late_s)[kept], whole.voltage_V[kept], whole.current_A[kept])
+    found, sound = (Settings(method=method).calibrator().estimate(each) for each in (record, whole))
+    assert not found.settled_q_mobile and "rows are missing together with their time" in found.reason
+    assert "rows are missing" not in sound.reason
+
+
+@pytest.mark.parametrize(("known", "other"), [("B0005", "B0006"), ("B0006", "B0005")])
+def test_a_cell_of_a_known_kind_is_settled_before_its_end(known, other):
+    fit = fit_cell([load_nasa_discharges(known)[n] for n in (2, 80, 150)], cut_off_V=2.7)
+    settings, settled = Settings.for_cell(fit), 0
+    for discharge in load_nasa_discharges(other)[20:160:35]:
+        whole = settings.calibrator().estimate(discharge.loaded_part(2.7))
+        seen = discharge.until(0.98 * discharge.eod_time_s(2.7)).loaded_part(2.7)
+        found = settings.calibrator().estimate(seen)
+        settled += found.settled
+        assert whole.settled and found.q_mobile == pytest.approx(whole.q_mobile, rel=0.04)
+    assert settled >= 3
