@@ -26,6 +26,7 @@ from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
 from battery_env.estimators import CellFit, Estimator, ExtendedKalmanFilter, LeastSquares, fit_cell
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
+from battery_env.lab.settings import Settings
 from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, new_figure, plot_cell_fit
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.records.model import RecordModel
@@ -83,7 +84,9 @@ def estimates(
 def least_squares(prior_q_mobile_C: float | None = None) -> LeastSquares:
     """Least squares with the constants of the new cell."""
     prior = None if prior_q_mobile_C is None else (prior_q_mobile_C, PRIOR_SD_SHARE * prior_q_mobile_C)
-    return LeastSquares(thermal=True, mismatch_V=UNFITTED_MISMATCH_V, prior_q_mobile_C=prior)
+    calibrator = Settings(method="least-squares", prior_q_mobile_C=prior).calibrator()
+    assert isinstance(calibrator, LeastSquares)
+    return calibrator
 
 
 # over the lives of both cells
@@ -235,7 +238,7 @@ def plot_voltages(discharges: Mapping[str, Sequence[Discharge]], whole: pd.DataF
             since_s = record.time_s - start_s
             axes.plot(since_s, record.voltage_V, "o", ms=2.6, color=COLOUR_OF["measured"], label="measured")
             for estimate, style, colour, label in (
-                (Estimate(fit["q_mobile_C"], fit["r_o_ohm"]), "-", COLOUR_OF["least squares"], "model, fitted"),
+                (least_squares().estimate(record), "-", COLOUR_OF["least squares"], "model, fitted"),
                 (_NEW, "--", COLOURS[4], "model, new cell's parameters"),
             ):
                 forecast = _THERMAL.forecast(record, estimate, CUT_OFF_V)
@@ -281,7 +284,7 @@ def fitted_row(discharge: Discharge, calibrator: LeastSquares) -> dict[str, Any]
     """Calibrate to one discharge and to its beginnings, in one row."""
     record = discharge.loaded_part(CUT_OFF_V)
     whole, *beginnings = estimates(discharge, calibrator, calibrator.model, (1.0, *SHARES))
-    residual_V = calibrator.model.voltage(record, Estimate(whole["q_mobile_C"], whole["r_o_ohm"])) - record.voltage_V
+    residual_V = calibrator.model.voltage(record, calibrator.estimate(record)) - record.voltage_V
     row = {name: whole[name] for name in ("cycle", "capacity_Ah", "q_mobile_C", "r_o_ohm")}
     row |= {"voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))), "settled": whole["settled"]}
     for found in beginnings:

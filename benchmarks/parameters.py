@@ -19,8 +19,9 @@ import numpy as np
 import pandas as pd
 
 from battery_env import Estimate
-from battery_env.estimators import ExtendedKalmanFilter, LeastSquares
+from battery_env.estimators import ExtendedKalmanFilter
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
+from battery_env.lab.settings import Settings
 from battery_env.loads import constant
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.records.model import RecordModel
@@ -32,7 +33,7 @@ OTHER_CUT_OFFS_V = (3.0, 3.2)
 PULSE_S = 10.0
 
 _METHODS = {
-    "least_squares": LeastSquares(thermal=True, mismatch_V=UNFITTED_MISMATCH_V),
+    "least_squares": Settings(method="least-squares").calibrator(),
     "kalman": ExtendedKalmanFilter(thermal=True, mismatch_V=UNFITTED_MISMATCH_V),
 }
 _MODEL = RecordModel(thermal=True)
@@ -65,14 +66,14 @@ def capacity_Ah(estimate: Estimate, load_A: float, cut_off_V: float) -> tuple[fl
     step_C, step_ohm = 0.01 * estimate.q_mobile, 0.002
     q_mobile = estimate.q_mobile + step_C * np.array([0.0, -1.0, 1.0, 0.0])
     r_o = estimate.r_o + np.array([0.0, 0.0, 0.0, step_ohm])
-    value, less, more, of_r = _MODEL.capacity_Ah([constant(load_A, "current")], cut_off_V, q_mobile, r_o).tolist()
+    value, less, more, of_r = _MODEL.at(estimate).capacity_Ah([constant(load_A, "current")], cut_off_V, q_mobile, r_o).tolist()
     by_q, by_r = (more - less) / (2.0 * step_C), (of_r - value) / step_ohm
     return value, float(np.hypot(by_q * estimate.sd_q_mobile, by_r * estimate.sd_r_o))
 
 
 def pulse_ohm(estimate: Estimate, current_A: float) -> tuple[float, float]:
     """The fall of its voltage within ``PULSE_S`` from full charge, over the current, and its standard deviation."""
-    columns = _MODEL.sensitivities(np.full(int(PULSE_S) + 1, current_A), estimate.q_mobile, estimate.r_o)
+    columns = _MODEL.at(estimate).sensitivities(np.full(int(PULSE_S) + 1, current_A), estimate.q_mobile, estimate.r_o)
     value, by_q, by_r = ((column[0] - column[-1]) / current_A for column in columns)
     return float(value), float(np.hypot(by_q * estimate.sd_q_mobile, by_r * estimate.sd_r_o))
 

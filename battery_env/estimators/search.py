@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from math import inf, isnan
+from math import inf, isnan, log
 from typing import Any
 
 import numpy as np
@@ -271,6 +271,8 @@ class Search:
             if len(inside) in (0, len(free)):
                 break
             free = inside
+        reached = self.model_at(values).cell  # with the rates that the steps of the model allow
+        values |= {name: log(getattr(reached, name) / getattr(self.model.cell, name)) for name in self._rates}
         residual, jacobian = self.weighed(values, priors, error)
         at_bound = tuple(name for name in self.parameters if values[name] in self._bounds_at(values)[name])
         return Fit(values, jacobian, self.residual(values)[0], square(residual), at_bound)
@@ -344,12 +346,16 @@ class Search:
         """Return the model with the nuisance constants at some values."""
         cell = self.model.cell
         constants = {}
-        for name in self.nuisance.keys() & set(RATE_CONSTANTS):
+        for name in self._rates:
             # a step of the search may go far, but explicit Euler is stable only for rates below 2 / dt
             constant = getattr(cell, name) * float(np.exp(_within(values[name], (-_REACH, _REACH))))
             constants[name] = max(constant, self._least_stable(name))
         added_V = tuple(values[name] for name in EQUILIBRIUM_NAMES) if self._has_equilibrium else ()
         return _with_constants(self.model, tuple(constants.items()), added_V)
+
+    @property
+    def _rates(self) -> list[str]:
+        return [name for name in RATE_CONSTANTS if name in self.nuisance]
 
     @property
     def _has_equilibrium(self) -> bool:

@@ -319,7 +319,7 @@ class TestTask:
             assert estimate.q_mobile == pytest.approx(found.q_mobile, rel=0.005)
             assert estimate.r_o == pytest.approx(found.r_o, rel=0.08)
             assert estimate.sd_q_mobile == pytest.approx(found.sd_q_mobile, rel=0.3)
-            shown_V = RecordModel(cell_with(b0006.cell, estimate.constants)).voltage(record, estimate)
+            shown_V = RecordModel(b0006.cell).voltage(record, estimate)
             assert np.sqrt(np.mean((shown_V - record.voltage_V)[1:] ** 2)) < 0.012
             # what rests on the path is not settled
             assert not trace.settled_q_mobile[: len(trace.time_s) * 3 // 4].any()

@@ -205,16 +205,20 @@ def test_the_record_chooses_the_method_and_not_what_comes_out(recorded):
         assert battery_env.calibrate(record, **options).method == method, (method, options)
 
 
-def test_a_large_cell_at_1C_says_that_its_charge_is_known_though_its_resistance_is_not(tmp_path, terminal):
+def test_a_cell_of_more_than_twice_the_size_is_settled_at_1C_and_one_number_alone_at_C_over_30(tmp_path, terminal):
     path = write(simulate(5.0, 18_000.0, 0.026, load_unit="current", thermal=True, cut_off_V=2.69), tmp_path / "large.csv")
-    row = terminal.row(path, status=3)
-    assert not row["settled"] and row["settled_q_mobile"] and not row["settled_r_o"]
-    assert row["q_mobile_C"] == pytest.approx(18_000.0, rel=0.01) and row["reason"].startswith("R_o is not known to 30 %")
-    shown = terminal.shows(path, "--out", tmp_path, status=3)
+    row = terminal.row(path)
+    assert row["settled"] and row["q_mobile_C"] == pytest.approx(18_000.0, rel=0.01)
+    assert row["r_o_ohm"] == pytest.approx(0.026, abs=2.0 * row["sd_r_o_ohm"])
+    slow = write(
+        simulate(0.3, 18_000.0, 0.026, load_unit="current", thermal=True, cut_off_V=2.69, max_duration_s=80_000),
+        tmp_path / "slow.csv",
+    )
+    shown = terminal.shows(slow, "--out", tmp_path, status=3)
     assert "no   only q_max is" in shown and "Not settled: R_o is not known to 30 %" in shown and "--prior" not in shown
-    (table,) = pd.read_csv(tmp_path / "large_estimate.csv").to_dict(orient="records")
+    (table,) = pd.read_csv(tmp_path / "slow_estimate.csv").to_dict(orient="records")
     assert table["settled_q_mobile"] and not table["settled_r_o"]
-    assert "only q_max settled: R_o is not" in repr(battery_env.calibrate(path)[0])
+    assert "only q_max settled: R_o is not" in repr(battery_env.calibrate(slow)[0])
     # what is held is not known by this record
     assert "only" not in str(battery_env.calibrate(path, parameters=("r_o",))[0])
 

@@ -6,7 +6,7 @@ import pytest
 from battery_env import TrajectoryDataset
 from battery_env.electrochemistry import NEW_CELL, QNB, QNS, VO, simulate
 from battery_env.loads import RandomPiecewise
-from battery_env.tasks.voltage.readings import SHOWN, Readings, explain
+from battery_env.tasks.voltage.readings import SENSOR_ROWS, Readings, explain
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +17,7 @@ def readings(aged_both):
 def compare(readings, q_mobile, r_o, count=None, stretches=12):
     """Means of residuals, slopes and ohmic drops, root mean square and last voltage of all discharges."""
     n = len(readings)
-    shown = np.zeros((SHOWN, n, readings.count.max()))
+    shown = np.zeros((SENSOR_ROWS, n, readings.count.max()))
     for k in range(n):
         shown[:, k, : readings.count[k]] = readings.shown(k)
     means, rms_V, last_V = np.full((3, n, stretches, 2), np.nan), np.full(n, np.nan), np.full(n, np.nan)

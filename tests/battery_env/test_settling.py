@@ -365,7 +365,7 @@ class TestPrecision:
     @pytest.mark.parametrize(("cell", "index"), [("B0005", 80), ("B0006", 160)])
     def test_the_filter_states_what_the_error_of_its_model_leaves_open(self, cell, index):
         record = load_nasa_discharges(cell)[index].loaded_part(2.7)
-        filtered, fitted = (CALIBRATORS[name]().estimate(record) for name in ("filter", "least squares"))
+        filtered, fitted = (Settings(method=method).calibrator().estimate(record) for method in METHODS[1::-1])
         assert abs(filtered.q_mobile - fitted.q_mobile) < 1.5 * filtered.sd_q_mobile
         assert filtered.settled and 0.5 < filtered.sd_q_mobile / fitted.sd_q_mobile < 2.5
 

@@ -34,7 +34,7 @@ def test_fitted_constants_are_better_on_the_other_cell(tmp_path):
     assert len(scores) == 2 * 2 * 3
     rmse_V = scores.groupby(["cell", "constants"])["voltage_rmse_V"].median()
     for trained, tested in cells.PAIRS:
-        assert rmse_V[tested, f"fitted to {trained}"] < 0.7 * rmse_V[tested, "of the new cell"]
+        assert rmse_V[tested, f"fitted to {trained}"] < 0.9 * rmse_V[tested, "of the new cell"]
         assert (tmp_path / f"{trained}_on_{tested}.png").stat().st_size > 0
     constants = pd.read_csv(tmp_path / "constants.csv")
     assert set(constants["fitted_to"]) == {"B0005", "B0006"} and (constants["sd"] <= constants["prior_sd"]).all()
