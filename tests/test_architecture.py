@@ -252,13 +252,15 @@ def test_no_function_is_long_and_no_private_name_leaves_its_module(path):
 #: sentence beside it that names the user who needs it, and what went for it.
 MOST = {
     # 196 for the page: whoever writes no code and has a file that is read wrongly, and the owner of a shared machine, whom a
-    # secret address and the process that removes files protect; what the command did of it is shared, and nothing else went
-    ("lines", "battery_env"): 19_288,
+    # secret address and the process that removes files protect; what the command did of it is shared, and nothing else went.
+    # 247 lines and 3 numbers for the error that drifts and for steps of the voltage: engineers with worn cells, whose slow
+    # diffusion was stated as R_o, and with records that lost rows; the formula of one common error went
+    ("lines", "battery_env"): 19_535,
     ("lines", "sb3_lac"): 6_931,
-    ("lines", "benchmarks"): 6_467,
+    ("lines", "benchmarks"): 6_471,
     # the same users: the page is started, asked by strangers, killed, and looked at in a browser
-    ("lines", "tests"): 18_568,
-    ("numbers at the top of modules", "battery_env"): 205,
+    ("lines", "tests"): 18_637,
+    ("numbers at the top of modules", "battery_env"): 208,
     ("numbers at the top of modules", "sb3_lac"): 20,
     ("starred calls", "battery_env"): 63,
     ("starred calls", "sb3_lac"): 41,
