@@ -881,7 +881,7 @@ def test_what_is_left_aside_is_named_and_a_mistake_in_some_cycles_loses_no_other
         (found,) = read_discharges(pd.concat([cycle, small], ignore_index=True))
     assert found.charge_C == pytest.approx(10.0 * RECORD.charge_C, rel=3e-3)
     wrong = cycle.assign(current=1e3 * cycle["current"], time=cycle["time"] - 9000.0, Cycle=0)
-    with pytest.warns(UserWarning, match=r"left out are the cycles 0, as 2.*A is no current of a cell.*--units current=mA"):
+    with pytest.warns(UserWarning, match=r"current_A must lie within -1000 .. 1000 A, got 2.*left out"):
         (found,) = read_discharges(pd.concat([wrong, cycle], ignore_index=True))
     assert found.charge_C == pytest.approx(10.0 * RECORD.charge_C, rel=3e-3)
 

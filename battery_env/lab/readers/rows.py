@@ -6,16 +6,18 @@ refused with its rows.
 
 from __future__ import annotations
 
+import csv
 import re
 import warnings
 from collections.abc import Callable, Mapping
+from io import StringIO
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from battery_env.arrays import BoolArray, FloatArray, IntArray
-from battery_env.checks import LOAD_LIMITS, ZERO_CELSIUS_K
+from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.lab.readers.columns import Column, FileFormat, direction, say
 from battery_env.lab.readers.testers import REQUIRED
 from battery_env.records import LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE
@@ -61,7 +63,7 @@ def cells_of(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
 def rows_of_cell(table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> pd.DataFrame:
     """The rows of a cell in SI units, and in order; the current has the sign of the file."""
     rows = with_current(on_its_clock(in_si_units(table, columns), columns), columns, file_format)
-    for mend in (of_possible_cycles, without_incomplete, without_dead_ends, with_newest_last, with_one_row_at_a_time):
+    for mend in (without_incomplete, without_dead_ends, with_newest_last, with_one_row_at_a_time):
         rows = mend(rows)
     return rows
 
@@ -169,6 +171,10 @@ def seconds(values: pd.Series, column: Column) -> FloatArray:
     text = values.astype("string").fillna("").str.strip()
     if not text.str.contains(":").mean() > 0.5 * (text != "").mean():
         return numbers(values, column)
+    if (text.str.count(":") == 2).all():
+        plain_s = _plain_clock_s(text)
+        if np.isfinite(plain_s).all():
+            return plain_s
     for pattern, clock in _AS_CLOCKS.items():
         text = text.str.replace(pattern, clock, regex=True)
     text = text.astype(object).where(text != "", None)
@@ -184,6 +190,24 @@ def seconds(values: pd.Series, column: Column) -> FloatArray:
     _check_readable(values, pd.Series(np.isnan(found_s[0]), values.index), column, what)
     # a day taken for a month makes a month of midnight
     return min(found_s, key=lambda time_s: float(np.abs(np.nan_to_num(np.diff(time_s))).max(initial=0.0)))
+
+
+def _plain_clock_s(text: pd.Series) -> FloatArray:
+    """The seconds of hours:minutes:seconds, of millions of rows as of few; NaN where it is anything else."""
+    parts = pd.read_csv(
+        StringIO("\n".join(text)),
+        sep=":",
+        header=None,
+        names=["hours", "minutes", "seconds"],
+        dtype=str,
+        keep_default_na=False,
+        skip_blank_lines=False,
+        quoting=csv.QUOTE_NONE,
+    )
+    hours, minutes, rest_s = (pd.to_numeric(parts[name], errors="coerce") for name in parts)
+    is_plain = parts["hours"].str.isdecimal() & parts["minutes"].str.isdecimal() & parts["seconds"].str[:1].str.isdecimal()
+    is_plain &= (minutes < 60.0) & (rest_s < 60.0)
+    return np.asarray((3600.0 * hours + 60.0 * minutes + rest_s).where(is_plain), dtype=np.float64)
 
 
 def _total_s(times: pd.Series) -> FloatArray:
@@ -308,22 +332,6 @@ def with_current(rows: pd.DataFrame, columns: Mapping[str, Column], file_format:
         return rows.assign(current=(rows["charge_step"] / step_s.where(step_s > 0.0)).bfill())
     say(f"the current is {columns['power'].name} over {columns['voltage'].name}, as there is no column for it")
     return rows.assign(current=rows["power"] / voltage_V.where(voltage_V > 0.0))
-
-
-def of_possible_cycles(rows: pd.DataFrame) -> pd.DataFrame:
-    """Without cycles in which a current flows that no cell carries, as of milliamperes in some of them alone."""
-    if "cycle" not in rows:
-        return rows
-    most_A = rows["current"].abs().groupby(rows["cycle"]).transform("max")
-    left_out = (most_A > LOAD_LIMITS["current"]).to_numpy()
-    if not left_out.any() or left_out.all():
-        return rows
-    cycles = ", ".join(f"{each:.0f}" for each in rows["cycle"][left_out].unique()[:9])
-    say(
-        f"left out are the cycles {cycles}, as {most_A.max():g} A is no current of a cell: row {place_of(rows, left_out)}. If "
-        "all are in mA: --units current=mA"
-    )
-    return rows[~left_out]
 
 
 def without_incomplete(rows: pd.DataFrame) -> pd.DataFrame:
