@@ -254,9 +254,9 @@ MOST = {
     # 196 for the page: whoever writes no code and has a file that is read wrongly, and the owner of a shared machine, whom a
     # secret address and the process that removes files protect; what the command did of it is shared, and nothing else went.
     # 247 lines and 3 numbers for the error that drifts and for steps of the voltage: engineers with worn cells, whose slow
-    # diffusion was stated as R_o, and with records that lost rows; the formula of one common error went. 8 for exports of
+    # diffusion was stated as R_o, and with records that lost rows; the formula of one common error went. 11 for exports of
     # millions of rows with a clock as text; the rule for cycles of impossible currents went
-    ("lines", "battery_env"): 19_543,
+    ("lines", "battery_env"): 19_546,
     ("lines", "sb3_lac"): 6_931,
     ("lines", "benchmarks"): 6_471,
     # the same users: the page is started, asked by strangers, killed, and looked at in a browser

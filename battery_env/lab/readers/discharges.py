@@ -133,10 +133,13 @@ def each_usable(use: Callable[[Discharge], Made], readers: Mapping[str, Callable
             except (TypeError, ValueError) as error:
                 number = f"discharge {recording.meta['cycle']}: " if "cycle" in recording.meta else ""
                 errors.append(ValueError(f"{name}: {number}{error}"))
-    if not made:
-        raise errors[0]
-    for reason in errors:
-        warnings.warn(f"{reason} It is left out.", stacklevel=3)
+    try:
+        if not made:
+            raise errors[0]
+        for reason in errors:
+            warnings.warn(f"{reason} It is left out.", stacklevel=3)
+    finally:
+        errors.clear()  # an error holds the frame that holds it, and with it what its reader had opened
     return made
 
 
