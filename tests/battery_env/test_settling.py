@@ -384,7 +384,7 @@ class TestPrecision:
         seen = record.until(record.time_s[0] + share * (record.time_s[-1] - record.time_s[0]))
         stated = [Settings.for_cell(young_fit, method=method, mismatch_V=0.0055) for method in METHODS[:2]]
         fitted, filtered = (settings.calibrator().estimate(seen) for settings in stated)
-        assert not filtered.settled and filtered.sd_q_mobile > 0.9 * fitted.sd_q_mobile
+        assert not filtered.settled and filtered.sd_q_mobile > 0.8 * fitted.sd_q_mobile
 
     def test_nor_is_it_by_a_prior(self, young_fit):
         record = load_nasa_discharges("B0006")[64].until(1800.0).loaded_part(2.7)
