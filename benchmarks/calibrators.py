@@ -38,7 +38,6 @@ from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.contests import HELD_OUT, SENSORS
-from benchmarks.greedy import GreedyOneStep
 from benchmarks.pretrained import OPTIONS
 from benchmarks.study import (
     SYMBOLS,
@@ -211,12 +210,6 @@ def _progpy(name: str, kind: Literal["ukf", "particles"]) -> Calibrator:
     return Calibrator(name, "voltage, prior", make, slow=True)
 
 
-def _greedy(name: str, resync: bool = True) -> Calibrator:
-    return Calibrator(
-        name, "full state", lambda unknown, told_V: GreedyOneStep(unknown[0], resync=resync, thermal=True), full_state=True
-    )
-
-
 def _generated(condition: Condition, unknown: Sequence[str], n: int, **options: Any) -> TrajectoryDataset:
     cell = WORN_CELL if condition.other_worn else NEW_CELL
     return TrajectoryDataset.generate(unknown, n, RandomPiecewise(), SEEDS[tuple(unknown)], cell=cell, **options)
@@ -245,8 +238,6 @@ it exactly, all others are told 5 mV of noise; the Kalman filter allows for an o
     ),
     (
         Calibrator("closed form", "full state", lambda unknown, told_V: ClosedForm(), full_state=True),
-        _greedy("greedy one-step cost"),
-        _greedy("greedy, free-running", resync=False),
         _least_squares("least squares, whole discharge", "voltage", thermal=True),
         _least_squares("least squares, growing window", "voltage", thermal=True, window_every_s=WINDOWS_S["peers"]),
         _kalman("extended Kalman filter", "voltage, prior", thermal=True),

@@ -45,23 +45,23 @@ class TestWork:
 
     def test_each_calibrator_meets_each_condition_but_where_few_are_tried(self):
         counts = {name: [part["discharges"] for part in calibrators.parts(name, 30)] for name in COMPARISONS}
-        # eight alone on either parameter, two of progpy's on few discharges; two of them under four conditions, and on both
-        assert len(counts["peers"]) == 8 * 2 + 2 * (4 * 2 + 1) and counts["peers"].count(2) == 2 * 2
+        # six alone on either parameter, two of progpy's on few discharges; two of them under four conditions, and on both
+        assert len(counts["peers"]) == 6 * 2 + 2 * (4 * 2 + 1) and counts["peers"].count(2) == 2 * 2
         # four of five on either parameter, half of the discharges each
         assert len(counts["faults"]) == 7 * 5 + 4 * 2 and counts["faults"].count(15) == 4 * 2
         assert len(counts["mismatch"]) == 4 * 6
 
 
 def test_peers_are_as_good_as_they_can_be_until_a_sensor_is_wrong(tmp_path, monkeypatch, capsys):
-    names = ("closed form", "greedy one-step cost", "least squares, whole discharge", "extended Kalman filter")
+    names = ("closed form", "least squares, whole discharge", "extended Kalman filter")
     among(monkeypatch, "peers", slice(0, 6, 3), names)
     results, text = make(tmp_path, "peers", "--discharges", "2")
     last = results.groupby(["calibrator", "case", "parameter"])["final_error_percent"].max()
-    for parameter, limits in {"q_mobile": (1e-9, 1e-4, 0.02, 0.1), "r_o": (1e-9, 1e-9, 0.1, 0.5)}.items():
+    for parameter, limits in {"q_mobile": (1e-9, 0.02, 0.1), "r_o": (1e-9, 0.1, 0.5)}.items():
         for name, limit in zip(names, limits, strict=True):
             assert last[name, "5 mV noise", parameter] < limit
         assert last["least squares, whole discharge", "+1 % current", parameter] > 0.5
-    assert text in capsys.readouterr().out and text.count("\n| ") == 1 + 4 + 2
+    assert text in capsys.readouterr().out and text.count("\n| ") == 1 + 3 + 2
 
 
 def test_a_wrong_current_goes_into_both_parameters(tmp_path, monkeypatch):
