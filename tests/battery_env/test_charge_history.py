@@ -13,6 +13,7 @@ from battery_env.estimators.diagnosis.gaps import doubtful_C
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.records import ChargeBefore, ChargeHistory, Samples, Stream
 from battery_env.records.load import switched_sd_C
+from tests.sweeps import sweep
 
 METHODS = ("least-squares", "kalman")
 TRUE_Q_C, TRUE_R_OHM, LOAD_A = 7000.0, 0.12, 2.0
@@ -39,7 +40,7 @@ def is_right(found, q_mobile_C: float = TRUE_Q_C, r_o_ohm: float = TRUE_R_OHM) -
 
 class TestLoadOn:
     @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize("every_s", [1.0, 10.0, 60.0, 120.0, 300.0, 600.0])
+    @pytest.mark.parametrize("every_s", sweep(60.0, 1.0, 10.0, 120.0, 300.0, 600.0))
     def test_its_doubt_covers_what_it_costs_however_far_apart_the_rows_are(self, every_s, method):
         for share in (0.02, 0.5, 0.98):
             found = calibrate(discharged(every_s, 3.0 * every_s, share * every_s), method=method)
@@ -49,7 +50,7 @@ class TestLoadOn:
             assert found.settled_q_mobile or every_s > 10.0, found.reason
             assert not found.settled_q_mobile or every_s < 200.0
 
-    @pytest.mark.parametrize("lost_s", [20.0, 60.0, 300.0, 900.0])
+    @pytest.mark.parametrize("lost_s", sweep(60.0, 20.0, 300.0, 900.0))
     def test_rows_that_are_lost_around_it_are_a_doubt_of_their_size_and_no_refusal(self, lost_s):
         whole = discharged(10.0, 300.0, 5.0)
         kept = (whole.time_s < 250.0) | (whole.time_s > 250.0 + lost_s)
@@ -80,7 +81,7 @@ class TestLoadOn:
 class TestRest:
     @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("rests_after", [True, False])
-    @pytest.mark.parametrize("offset_A", [-0.15, -0.05, -0.01, 0.01, 0.05, 0.15])
+    @pytest.mark.parametrize("offset_A", sweep(0.05, -0.15, -0.05, -0.01, 0.01, 0.15))
     def test_what_flows_there_is_counted_as_an_offset(self, offset_A, rests_after, method):
         rest_s = 20.0 * np.arange(45)
         time_s = np.concatenate([REAL.time_s[0] - 900.0 + rest_s, REAL.time_s])
@@ -120,7 +121,7 @@ def cycled(highest_V: float, last_A: float, rest_rows: int = 0, soc: float = 1.0
 class TestCharge:
     @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize(
-        ("soc", "highest_V"), [(0.97, 4.2), (0.97, 4.25), (0.92, 4.15), (0.85, 4.1), (0.7, 4.0), (0.7, 4.2)]
+        ("soc", "highest_V"), sweep((0.97, 4.2), (0.97, 4.25), (0.92, 4.15), (0.85, 4.1), (0.7, 4.0), (0.7, 4.2))
     )
     def test_one_that_did_not_taper_off_proves_no_full_cell(self, soc, highest_V, method):
         # its voltage under load is that of a full cell with a larger resistance
@@ -128,7 +129,7 @@ class TestCharge:
         assert not found.settled and f"ended at {highest_V:.2f} V, still under 3 A" in found.reason
 
     @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize("rest_rows", [0, 1, 100])
+    @pytest.mark.parametrize("rest_rows", sweep(0, 1, 100))
     def test_one_that_tapered_off_proves_a_full_cell_without_a_rest(self, rest_rows, method):
         table = cycled(4.2, 0.05, rest_rows)
         (found,) = calibrate(table, method=method)
@@ -139,7 +140,7 @@ class TestCharge:
         assert len(read_discharges(counted)) == 1 and read_discharges(counted)[0].history.charge is not None
 
     @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize(("last_A", "settled"), [(0.03, True), (0.1, None), (0.2, False), (0.3, False)])
+    @pytest.mark.parametrize(("last_A", "settled"), sweep((0.2, False), (0.03, True), (0.1, None), (0.3, False)))
     def test_what_a_taper_left_is_in_the_standard_deviation(self, last_A, settled, method):
         # about the charge that an exponential would have brought after its end
         left_C = last_A * 2000.0 / np.log(3.0 / last_A)
@@ -149,7 +150,7 @@ class TestCharge:
         assert settled is None or found.settled_q_mobile == settled == ("C left to take" not in found.reason)
 
     @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize("soc", [0.99, 0.98, 0.97, 0.965])
+    @pytest.mark.parametrize("soc", sweep(0.98, 0.99, 0.97, 0.965))
     def test_a_charge_cut_short_left_what_the_voltage_at_rest_shows(self, soc, method):
         table = cycled(4.25, 3.0, rest_rows=100, soc=soc)
         (found,), (alone,) = (calibrate(each, method=method) for each in (table, table[400:]))
@@ -185,7 +186,7 @@ class TestCharge:
 
 
 class TestCutOff:
-    @pytest.mark.parametrize("above_V", [8e-6, 1e-3, 2e-3, 4e-3])
+    @pytest.mark.parametrize("above_V", sweep(1e-3, 8e-6, 2e-3, 4e-3))
     def test_a_load_that_ends_within_its_last_fall_of_it_ends_there(self, above_V):
         whole = REAL.until(REAL.eod_time_s(2.7) + 5.0)
         lowest_V = float(whole.voltage_V[-1])
@@ -194,8 +195,8 @@ class TestCutOff:
         assert over.capacity_Ah == pytest.approx(plain.capacity_Ah, rel=1e-3)
         assert over.r_o_ohm == pytest.approx(plain.r_o_ohm, rel=1e-3)
 
-    @pytest.mark.parametrize("stop_V", [2.6997, 2.7003, 2.703])
-    @pytest.mark.parametrize("later_A", [[1.0], [1.0, 0.3]])
+    @pytest.mark.parametrize("stop_V", sweep(2.7003, 2.6997, 2.703))
+    @pytest.mark.parametrize("later_A", sweep([1.0], [1.0, 0.3]))
     def test_capacity_is_that_of_the_first_load_that_ends_there(self, stop_V, later_A):
         """Rate steps: each smaller load draws some more."""
         parts, state, now_s = [([0.0], [4.19], [0.0])], None, 10.0

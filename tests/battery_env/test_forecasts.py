@@ -438,15 +438,15 @@ class TestCommand:
         assert 0.6 < self.row(capsys, "running.csv", "--nominal", "2")["state_of_health"][1] < 0.9
 
     @pytest.mark.parametrize(
-        "options", [(), ("--prior", "5460", "55"), ("--cut-off", "3.2"), ("--initial-soc", "0.98,0.01", "--nominal", "2")]
+        "options", ["", *sweep("--prior 5460 55", "--cut-off 3.2", "--initial-soc 0.98,0.01 --nominal 2")]
     )
-    @pytest.mark.parametrize("name", ["running.csv", "pulsed.csv"])
+    @pytest.mark.parametrize("name", sweep("running.csv", "pulsed.csv"))
     def test_both_commands_give_one_end(self, name, options, capsys):
         pulses = simulate(np.tile([3.0, 1.0], 2000).repeat(30), 6500.0, 0.12, load_unit="current", thermal=True, until=2000.0)
         columns = {"time_s": pulses.time_s, "voltage_V": pulses.voltage_V, "current_A": pulses.current_A}
         pd.DataFrame(columns).to_csv("pulsed.csv", index=False)
-        end = self.row(capsys, name, *options)
-        main(["calibrate", name, *options, "--json"])
+        end = self.row(capsys, name, *options.split())
+        main(["calibrate", name, *options.split(), "--json"])
         row = json.loads(capsys.readouterr().out)
         low_s, median_s, high_s = end["eod_time_s"]
         assert row["predicted_eod_time_s"] == median_s and row["remaining_s"] == end["remaining_s"][1]

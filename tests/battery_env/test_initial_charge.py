@@ -11,6 +11,7 @@ from battery_env import Discharge, LeastSquares, RecordModel, fit_cell, load_nas
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.lab.command_line import NOT_SETTLED, SETTLED, calibrate
 from battery_env.loads import constant
+from tests.sweeps import sweep
 
 REST_S = 200
 
@@ -37,7 +38,7 @@ class TestStart:
 
 
 class TestRest:
-    @pytest.mark.parametrize("soc", [0.15, 0.5, 0.97])
+    @pytest.mark.parametrize("soc", sweep(0.5, 0.15, 0.97))
     def test_it_tells_the_charge_within_its_error(self, soc):
         found = soc_from_rest(partly_charged(soc, noise_V=0.005))
         assert found.samples == REST_S and found.reason == ""
@@ -62,7 +63,7 @@ class TestRest:
 
 
 class TestLeastSquares:
-    @pytest.mark.parametrize("soc", [0.3, 0.7, 0.95])
+    @pytest.mark.parametrize("soc", sweep(0.7, 0.3, 0.95))
     def test_a_charge_that_is_known_gives_both_parameters(self, soc):
         estimate = LeastSquares(thermal=True, initial_soc=soc).estimate(partly_charged(soc, noise_V=0.0))
         assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15), rel=1e-6) and estimate.settled

@@ -11,6 +11,7 @@ from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.estimators.reasons import SETTLED_SHARES
 from battery_env.evaluation import evaluate, summarize
 from battery_env.loads import RandomPiecewise
+from tests.sweeps import sweep
 
 NOISE_V = 0.005
 
@@ -53,7 +54,7 @@ class TestAccuracy:
             assert 0.9 < np.mean(np.abs(deviations) <= 2.0) < 0.999
             assert np.sqrt(np.mean(deviations**2)) > 0.4  # not by stating too much
 
-    @pytest.mark.parametrize("size", [0.02, 0.3, 30.0])
+    @pytest.mark.parametrize("size", sweep(30.0, 0.02, 0.3))
     def test_of_a_cell_of_any_size_it_says_the_same(self, size):
         def found(size):
             cell = NEW_CELL.replace(

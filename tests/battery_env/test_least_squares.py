@@ -11,6 +11,7 @@ from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.search import Prior, Search
 from battery_env.records import Samples
+from tests.sweeps import sweep
 
 
 def discharged(
@@ -31,9 +32,9 @@ def b0005() -> list[Discharge]:
 
 
 class TestCleanRecords:
-    @pytest.mark.parametrize("power_W", [4.0, 8.0, 16.0])
-    @pytest.mark.parametrize("q_mobile", [4000.0, 7600.0])
-    @pytest.mark.parametrize("r_o", [0.1, 0.2])
+    @pytest.mark.parametrize("power_W", sweep(16.0, 4.0, 8.0))
+    @pytest.mark.parametrize("q_mobile", sweep(7600.0, 4000.0))
+    @pytest.mark.parametrize("r_o", sweep(0.2, 0.1))
     def test_both_parameters_are_recovered_even_where_the_voltage_collapses(self, power_W, q_mobile, r_o):
         # 16 W at 0.2 ohm ends after less than a minute
         estimate = LeastSquares().estimate(discharged(q_mobile, r_o, power_W))
@@ -58,7 +59,7 @@ class TestCleanRecords:
         assert r_only.q_mobile == 6000.0 and np.isnan(r_only.sd_q_mobile)
 
     @pytest.mark.parametrize("thermal", [False, True])
-    @pytest.mark.parametrize("dt_s", [0.5, 2.0])
+    @pytest.mark.parametrize("dt_s", sweep(2.0, 0.5))
     def test_thermal_model_and_other_time_steps(self, thermal, dt_s):
         record = discharged(load=2.0, load_unit="current", thermal=thermal, dt=dt_s)
         estimate = LeastSquares(thermal=thermal, dt_s=dt_s).estimate(record)
@@ -174,7 +175,7 @@ class TestNuisanceConstants:
         assert abs(alone.q_mobile - 6000.0) > 20.0 and abs(beside.q_mobile - 6000.0) < 10.0
         assert beside.settled and not alone.settled
 
-    @pytest.mark.parametrize("share", [0.3, 0.6, 1.0])
+    @pytest.mark.parametrize("share", sweep(0.6, 0.3, 1.0))
     def test_errors_are_as_large_as_stated(self, share):
         scores = []
         for seed in range(8):
@@ -211,7 +212,7 @@ class TestNuisanceConstants:
 
 class TestRealDischarges:
 
-    @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+    @pytest.mark.parametrize("share", sweep(0.5, 0.1, 0.9))
     def test_an_unfinished_one_is_not_settled_and_a_prior_repairs_it(self, b0005, share):
         previous, record = b0005[98], b0005[99]
         fit = LeastSquares(thermal=True, mismatch_V=0.05)
@@ -224,7 +225,7 @@ class TestRealDischarges:
         eod_time_s = carried.model.forecast(beginning, carried.estimate(beginning), 2.7).eod_time_s
         assert eod_time_s == pytest.approx(record.time_s[-1], rel=0.015)
 
-    @pytest.mark.parametrize("cycle", [95, 125])
+    @pytest.mark.parametrize("cycle", sweep(95, 125))
     def test_the_deeper_of_two_minima_is_found(self, b0005, cycle):
         # the middle of these discharges is explained nearly as well by 3600 C as by 4500 C, and by 3200 C as by 4100 C
         record = b0005[cycle]
