@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from battery_env import LeastSquares, forecast, load_nasa_discharges, track_life
+from battery_env import Settings, forecast, load_nasa_discharges, track_life
 from battery_env.loads import Cycle, Load
 
 discharges = load_nasa_discharges("B0005")[:13]
 life = track_life(discharges[:12], cut_off_V=2.7)
-fit = LeastSquares(thermal=True, mismatch_V=0.05, prior_q_mobile_C=life.prior_q_mobile_C)
+fit = Settings(prior_q_mobile_C=life.prior_q_mobile_C).calibrator()
 
 record = discharges[12].loaded_part(cut_off_V=2.7)
 seen = record.until(1200.0)

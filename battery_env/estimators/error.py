@@ -5,15 +5,15 @@ likelihood of both, in whose units residuals are independent and of variance one
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import exp, expm1, sqrt
+from dataclasses import dataclass, field
+from math import exp, hypot, inf, sqrt
 
 import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
-from battery_env.electrochemistry.model_error import memory_share
 from battery_env.records import SWITCH_SHARE
+from battery_env.records.load import moment_sd_s, switched_sd_C
 
 # Real ohmic drops follow a current at once in part, where that of the model lags: this share of what lags is in doubt.
 _LATE_SHARE = 0.1
@@ -55,22 +55,28 @@ class ErrorModel:
     :param noise_V: standard deviation of the noise of the sensor
     :param r_o: the ohmic resistance, which follows its current late, ohm
     :param to: how late, s
+    :param memory_C: the charge along which the drift loses its memory
     :param load_on_C: the charge that is in doubt between the first sample, at rest, and the second, under load
+    :param dropouts_s: spans of time in which the voltage is not that of the current, s, shape (spans, 2)
     """
 
     drift_V: float = 0.0
     noise_V: float = 1.0
     r_o: float = 0.0
     to: float = 1.0
+    memory_C: float = 1.0
     load_on_C: float = 0.0
+    dropouts_s: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
 
-    def along(self, time_s: FloatArray, current_A: FloatArray, q_mobile_C: float) -> VoltageError:
+    def along(self, time_s: FloatArray, current_A: FloatArray) -> VoltageError:
         """
-        The error at samples of a cell with some ``q_mobile``. At rest the model goes wrong as time goes, as fast as under the
-        mean load; a load that changes by its largest current is a whole memory away. While the ohmic drop follows a switch, a
-        share of what is left of it is in doubt.
+        The error at samples. At rest the model goes wrong as time goes, as fast as under the mean load; a load that changes by
+        its largest current is a whole memory away. While the ohmic drop follows a switch, a share of what is left of it is in
+        doubt, and what the moment of the switch, between two samples, makes of it.
         """
         noise_V = np.full(len(time_s), self.noise_V)
+        for begin_s, end_s in self.dropouts_s:
+            noise_V[(time_s >= begin_s) & (time_s < end_s)] = inf
         if self.drift_V == 0.0:
             return VoltageError(np.zeros(len(time_s)), 0.0, noise_V)
         size_A, interval_s = np.abs(current_A), np.diff(time_s)
@@ -78,20 +84,28 @@ class ErrorModel:
         drawn_C = interval_s * np.maximum(size_A[:-1], size_A.mean())
         drawn_C[:1] += self.load_on_C
         changed_A = np.abs(np.diff(current_A))
-        way = drawn_C / (memory_share("forecast") * q_mobile_C)
+        way = drawn_C / self.memory_C
         way += np.where(changed_A > SWITCH_SHARE * most_A, changed_A, 0.0) / most_A
-        late_V = _LATE_SHARE * self.r_o * _late_A(interval_s, current_A, self.to)
+        # rows may meet a load that is switched again and again at the same place each time: then these errors go together
+        together_C, alone_C = switched_sd_C(time_s, current_A)
+        together = together_C / alone_C if alone_C else 1.0
+        late_V = self.r_o * _late_sd_A(interval_s, current_A, self.to, SWITCH_SHARE * most_A, together)
         return VoltageError(np.append(0.0, way), self.drift_V, np.hypot(noise_V, late_V))
 
 
 @compiled
-def _late_A(interval_s: FloatArray, current_A: FloatArray, to: float) -> FloatArray:
-    # the part of the current that the ohmic drop has yet to follow, after a first sample at rest
-    late_A, followed_A = np.zeros_like(current_A), 0.0
+def _late_sd_A(interval_s: FloatArray, current_A: FloatArray, to: float, switch_A: float, together: float) -> FloatArray:
+    # the standard deviation of the current that the ohmic drop stands for, after a first sample at rest
+    late_sd_A, followed_A, moment_sd_A = np.zeros_like(current_A), 0.0, 0.0
     for k in range(1, len(current_A)):
-        followed_A -= (current_A[k - 1] - followed_A) * expm1(-interval_s[k - 1] / to)
-        late_A[k] = current_A[k] - followed_A
-    return late_A
+        left = exp(-interval_s[k - 1] / to)
+        followed_A = current_A[k - 1] + left * (followed_A - current_A[k - 1])
+        switched_A = abs(current_A[k] - current_A[k - 1])
+        moment_sd_A *= left
+        if switched_A > switch_A:
+            moment_sd_A = hypot(moment_sd_A, switched_A * min(together * moment_sd_s(interval_s[k - 1]) / to, 1.0))
+        late_sd_A[k] = hypot(_LATE_SHARE * (current_A[k] - followed_A), moment_sd_A)
+    return late_sd_A
 
 
 @compiled

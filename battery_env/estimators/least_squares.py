@@ -15,10 +15,10 @@ from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES, AgingPath
 from battery_env.electrochemistry.ends import LONGEST_S
-from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_errors
+from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_errors, memory_share
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.diagnosis.evidence import evidence_of, measured, start_reason, unseen_C
+from battery_env.estimators.diagnosis.evidence import dropouts_s, evidence_of, measured, start_reason, unseen_C
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
@@ -246,7 +246,15 @@ class LeastSquares(Estimator):
             if drift_V and noise_V and self._at_rest:  # it is no smaller than the voltage at rest shows, beyond noise
                 start_V2 = float(at_start_V[0]) ** 2 - (MOST_NOISE_SD * noise_V) ** 2 - self.mismatch_V**2
                 drift_V = hypot(drift_V, sqrt(max(start_V2, 0.0)))
-            error = ErrorModel(drift_V, noise_V or 1.0, cell.r_o, cell.to, history.load_on_C)
+            error = ErrorModel(
+                drift_V,
+                noise_V or 1.0,
+                cell.r_o,
+                cell.to,
+                memory_share("forecast") * starts[0]["q_mobile"],
+                history.load_on_C,
+                dropouts_s(record, cell),
+            )
         else:
             mean, covariance = self.path.moments
             priors = [JointPrior(PATH_NAMES, mean, np.linalg.cholesky(np.linalg.inv(covariance)).T)]
@@ -297,8 +305,7 @@ class LeastSquares(Estimator):
                 moved["q_mobile"] *= soc / (soc + step)
                 by_soc[self.parameters.index("q_mobile")] = (moved["q_mobile"] - values["q_mobile"]) / step
             change_V = (nearby.residual(moved)[0] - at_V) / step
-            error = search.error.along(search.data.time_s, search.data.samples_A, values["q_mobile"])
-            weighed = error.whitened(np.nan_to_num(change_V)[:, None])[:, 0]
+            weighed = search.error_at_samples.whitened(np.nan_to_num(change_V)[:, None])[:, 0]
             rows = np.append(weighed, np.zeros(len(fit.jacobian) - len(weighed)))
             by_soc -= np.linalg.lstsq(fit.jacobian, rows, rcond=None)[0]
         return {

@@ -222,6 +222,7 @@ class Search:
         current_A = data.current_A[: points * stride].reshape(points, stride).mean(axis=1)
         time_s = data.grid_s[: points * stride : stride]
         voltage_V = np.interp(time_s, data.time_s, data.voltage_V)
+        error = self.error.along(time_s, current_A)
         starts, squares = [], []
         for candidate in q_candidates:
             q_mobile, r_o = candidate, cell.r_o
@@ -229,7 +230,6 @@ class Search:
                 low_C, high_C = self.bounds["q_mobile"]
                 q_mobile = _within(q_mobile, (max(low_C, (1.0 + MARGIN) * self.least_q_C), high_C))
             model_V, _, by_r_o_A = self.model.sensitivities(current_A, q_mobile, r_o, stride)
-            error = self.error.along(time_s, current_A, q_mobile)
             residual, by_r_o = error.whitened(np.column_stack([model_V - voltage_V, by_r_o_A])).T
             if "r_o" in self.parameters:
                 best_ohm = _within(r_o - float(residual @ by_r_o) / square(by_r_o), self.bounds["r_o"])
@@ -241,7 +241,10 @@ class Search:
         return starts, np.array(squares)
 
     def best_starts(self, more_q_C: Sequence[float]) -> list[dict[str, float]]:
-        """Return the local minima on a grid of ``q_mobile``, refined where promising, that may lead to the global one."""
+        """
+        Return the local minima on a grid of ``q_mobile``, refined where promising, that may lead to the global one, the least
+        first.
+        """
         excess = _START_EXCESS
         coarse, coarse_squares = self.starts((self.least_q_C * (1.0 + excess)).tolist())
         promising = _is_near_best(coarse_squares)
@@ -253,7 +256,8 @@ class Search:
         squares = squares[order]
         beside = np.pad(squares, 1, constant_values=np.inf)
         minima = (squares <= beside[:-2]) & (squares < beside[2:]) & _is_near_best(squares)
-        return [starts[order[n]] for n in np.union1d(np.flatnonzero(minima), squares.argmin())]
+        rivals = np.union1d(np.flatnonzero(minima), squares.argmin())
+        return [starts[order[n]] for n in rivals[np.argsort(squares[rivals], kind="stable")]]
 
     def best(self, starts: Sequence[dict[str, float]], priors: Sequence[Prior | JointPrior]) -> Fit:
         """Return the best fit that is found from any of the starts."""
@@ -261,9 +265,8 @@ class Search:
 
     def _fit(self, start: dict[str, float], priors: Sequence[Prior | JointPrior]) -> Fit:
         free, values = list(self.unknown), dict.fromkeys(self.nuisance, 0.0) | start
-        error = self.error.along(self.data.time_s, self.data.samples_A, start["q_mobile"])
         while True:
-            values = self._minimized(values, free, priors, error)
+            values = self._minimized(values, free, priors)
             bounds = self._bounds_at(values)
             clipped = {name: _within(values[name], bounds[name]) for name in free if name in bounds}
             inside = [name for name in free if clipped.get(name, values[name]) == values[name]]
@@ -273,7 +276,7 @@ class Search:
             free = inside
         reached = self.model_at(values).cell  # with the rates that the steps of the model allow
         values |= {name: log(getattr(reached, name) / getattr(self.model.cell, name)) for name in self._rates}
-        residual, jacobian = self.weighed(values, priors, error)
+        residual, jacobian = self.weighed(values, priors)
         at_bound = tuple(name for name in self.parameters if values[name] in self._bounds_at(values)[name])
         return Fit(values, jacobian, self.residual(values)[0], square(residual), at_bound)
 
@@ -283,9 +286,7 @@ class Search:
         of_q_C = (max(low_C, (1.0 + MARGIN) * least_C), high_C)
         return {**dict.fromkeys(RATE_CONSTANTS, (-_REACH, _REACH)), **self.bounds, "q_mobile": of_q_C}
 
-    def _minimized(
-        self, start: dict[str, float], free: list[str], priors: Sequence[Prior | JointPrior], error: VoltageError
-    ) -> dict[str, float]:
+    def _minimized(self, start: dict[str, float], free: list[str], priors: Sequence[Prior | JointPrior]) -> dict[str, float]:
         unknown = self.unknown
         columns = [unknown.index(name) for name in free]
 
@@ -298,7 +299,7 @@ class Search:
 
         def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
             values, least_C, least_by_log_C = values_at(x)
-            residual, by_unknown = self.weighed(values, priors, error)
+            residual, by_unknown = self.weighed(values, priors)
             slopes = [values[name] - least_C if name == "q_mobile" else 1.0 for name in free]
             by_x = by_unknown[:, columns] * slopes
             if "q_mobile" in free and "tDiffusion" in free:  # which moves q_mobile along with its least value
@@ -315,12 +316,15 @@ class Search:
         )
         return values_at(x)[0]
 
-    def weighed(
-        self, values: Mapping[str, float], priors: Sequence[Prior | JointPrior], error: VoltageError
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return residuals as an error weighs them, with one more for each prior, and their derivatives by all unknowns."""
+    @cached_property
+    def error_at_samples(self) -> VoltageError:
+        """The error of the voltage at the samples."""
+        return self.error.along(self.data.time_s, self.data.samples_A)
+
+    def weighed(self, values: Mapping[str, float], priors: Sequence[Prior | JointPrior]) -> tuple[FloatArray, FloatArray]:
+        """Return residuals as their error weighs them, with one more for each prior, and their derivatives by all unknowns."""
         residual_V, jacobian_V = self.residual(values)
-        rows = error.whitened(np.column_stack([residual_V, jacobian_V]))
+        rows = self.error_at_samples.whitened(np.column_stack([residual_V, jacobian_V]))
         residual, jacobian = rows[:, 0], rows[:, 1:]
         for prior in priors:
             known, by_unknown = prior.residual(values, self.unknown)

@@ -22,6 +22,7 @@ from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import is_only_imprecise
+from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome
 from battery_env.records import VARIED_SHARE, drawn, mean_current_A
 from battery_env.records.discharge import Discharge
@@ -164,15 +165,16 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     .. code-block:: python
 
       life = track_life(load_nasa_discharges("B0005")[:60], cut_off_V=2.7)
-      next_fit = LeastSquares(thermal=True, mismatch_V=0.05, prior_q_mobile_C=life.prior_q_mobile_C)
+      next_fit = Settings(prior_q_mobile_C=life.prior_q_mobile_C).calibrator()
       print(life.remaining_discharges(threshold_Ah=1.4))
 
     :param discharges: of one cell, in their order
     :param cut_off_V: where they end, V
-    :param calibrator: without a prior; ``None``: ``LeastSquares(thermal=True, mismatch_V=0.05)``
+    :param calibrator: without a prior; ``None``: least squares with the constants of a new 18650 as they are
     :raises ValueError: if no discharge is valid, or the calibrator has a prior or no full cell at the start
     """
-    calibrator = LeastSquares(thermal=True, mismatch_V=0.05) if calibrator is None else calibrator
+    if calibrator is None:
+        calibrator = Settings(method="least-squares", cell_rates_sd={}).calibrator()
     if calibrator.prior_q_mobile_C is not None:
         raise ValueError("the calibrator must have no prior of q_mobile: each discharge has to speak for itself")
     if calibrator.initial_soc != (1.0, 0.0):

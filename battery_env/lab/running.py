@@ -136,7 +136,7 @@ def forecast_end(
     """
     settings = Settings() if settings is None else settings
     if life is not None:
-        settings = replace(settings, prior_q_mobile_C=life.prior_for(discharge, load))
+        settings = _with_prior(settings, life.prior_for(discharge, load))
     end = calibrated(discharge, settings, load, samples, end_is_asked=True).end
     assert end is not None
     return end
@@ -207,6 +207,11 @@ def _read_life(arguments: Sequence[str], running: Source, file_format: FileForma
     return discharges
 
 
+def _with_prior(settings: Settings, prior_q_mobile_C: tuple[float, float]) -> Settings:
+    """What a life tells of ``q_mobile``, with the constants by which it was tracked."""
+    return replace(settings, prior_q_mobile_C=prior_q_mobile_C, cell_rates_sd={})
+
+
 def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
     """The life of a cell, by whole discharges that are looked at as the next one is."""
     # all of them have the same constants, whatever these are
@@ -235,7 +240,7 @@ def end_of_record(
         if len(named) > 1:
             raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")
         past = life_before(before, settings)
-        settings = replace(settings, prior_q_mobile_C=past.prior_for(running, to_come))
+        settings = _with_prior(settings, past.prior_for(running, to_come))
     found = calibrated(running, settings, to_come, end_is_asked=True)
     if not found.in_progress:
         raise ValueError(

@@ -201,7 +201,8 @@ class Settings:
         q_mobile_C = float(np.clip(UNDELIVERED * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
         if (cell := new_cell_of(q_mobile_C)) is NEW_CELL:
             return self
-        return replace(self, cell=cell, prior_q_mobile_C=(q_mobile_C, PRIOR_SD_SHARE_Q * q_mobile_C))
+        prior_C = (q_mobile_C, PRIOR_SD_SHARE_Q * q_mobile_C)
+        return replace(self, cell=cell, prior_q_mobile_C=prior_C, cell_rates_sd=RATE_PRIOR_SD)
 
     def other_load(self, current_A: float) -> str:
         """Why the constants may not hold for a mean current; empty if they do."""
@@ -252,10 +253,12 @@ class Settings:
     def _rates_sd(self) -> Mapping[str, float]:
         """
         How well the rate constants are known, that are searched for beside both parameters: all that least squares are not
-        told. A path tells them, and the prior of a life is for the constants as they are.
+        told. A path tells them, and a prior that is stated alone is for the constants as they are.
         """
-        if self.path is not None or self.prior_q_mobile_C is not None:
+        if self.path is not None:
             return {}
         if self.cell_rates_sd is not None:
             return self.cell_rates_sd
+        if self.prior_q_mobile_C is not None:
+            return {}
         return RATE_PRIOR_SD if self.cell is None else dict.fromkeys(RATE_PRIOR_SD, SAME_KIND_SD)

@@ -165,7 +165,7 @@ class Discharge:
         # when the load came on may be told, and a count is that of the load alone
         begin = first if self._told_load_on_s is not None else max(first - 1, 0)
         unknown = [slice(begin, first + 1), slice(last, last + 2)] if history.is_counted else [slice(begin, None)]
-        switched_C = [switched_sd_C(self.time_s[rows], self.current_A[rows]) for rows in unknown]
+        switched_C = [switched_sd_C(self.time_s[rows], self.current_A[rows])[0] for rows in unknown]
         return hypot(history.load_on_C, history.offset_A * float(np.ptp(self.time_s)), history.uncounted_C, *switched_C)
 
     @property

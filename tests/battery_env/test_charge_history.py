@@ -241,11 +241,11 @@ class TestSwitches:
         """Errors of rows that meet a load at the same place each time do not cancel."""
         time_s, one_C = 10.0 * np.arange(41), 10.0 / np.sqrt(12.0)
         like = np.where(np.arange(41) // 2 % 2, 2.0, 1.0)
-        assert switched_sd_C(time_s, like) == pytest.approx(one_C * np.hypot(10.0, 10.0))
+        assert switched_sd_C(time_s, like) == pytest.approx(one_C * np.array([np.hypot(10.0, 10.0), np.sqrt(20.0)]))
         growing = 1.0 + np.cumsum(np.where(np.arange(41) % 2, 1.0, -1.0) * 1.3 ** (np.arange(41) / 4.0))
         sizes = np.abs(np.diff(growing))
-        assert switched_sd_C(time_s, growing) == pytest.approx(one_C * np.sqrt((sizes**2).sum()))
-        assert switched_sd_C(time_s, np.linspace(1.0, 2.0, 41)) == 0.0
+        assert switched_sd_C(time_s, growing) == pytest.approx([one_C * np.sqrt((sizes**2).sum())] * 2)
+        assert switched_sd_C(time_s, np.linspace(1.0, 2.0, 41)) == (0.0, 0.0)
 
     def test_a_count_of_the_tester_leaves_none(self):
         current_A = np.where(np.arange(len(REAL.time_s)) // 3 % 2, REAL.current_A, 0.3 * REAL.current_A)

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from battery_env import NEW_CELL, Discharge, Settings, fit_cell, load_nasa_discharges, simulate
+from battery_env import NEW_CELL, Discharge, LeastSquares, Settings, fit_cell, load_nasa_discharges, simulate
+from battery_env.estimators.diagnosis.evidence import dropouts_s
 from battery_env.estimators.error import ErrorModel
+from battery_env.records import Samples
 from tests.sweeps import sweep
 
 
@@ -12,13 +14,13 @@ from tests.sweeps import sweep
 def test_whitened_errors_are_those_of_the_whole_covariance(load):
     time_s = np.cumsum(np.random.default_rng(0).uniform(1.0, 20.0, 80))
     current_A = np.where((load == "pulses") & (time_s % 100.0 < 50.0), 0.2, 2.0)
-    error = ErrorModel(drift_V=0.05, noise_V=0.002, r_o=0.1, to=6.0, load_on_C=100.0).along(time_s, current_A, 6000.0)
+    error = ErrorModel(drift_V=0.05, noise_V=0.002, r_o=0.1, to=6.0, memory_C=900.0, load_on_C=100.0).along(time_s, current_A)
     place = np.cumsum(error.way)
     covariance = 0.05**2 * np.exp(-np.abs(place[:, None] - place)) + np.diag(error.noise_V**2)
     rows = np.random.default_rng(1).normal(size=(80, 3))
     white = error.whitened(rows)
     np.testing.assert_allclose(white.T @ white, rows.T @ np.linalg.solve(covariance, rows), rtol=1e-9)
-    np.testing.assert_array_equal(ErrorModel(noise_V=0.5).along(time_s, current_A, 6000.0).whitened(rows), rows / 0.5)
+    np.testing.assert_array_equal(ErrorModel(noise_V=0.5).along(time_s, current_A).whitened(rows), rows / 0.5)
 
 
 @pytest.mark.parametrize("slower", sweep(3.0, 0.5, 2.0))
@@ -57,3 +59,22 @@ def test_a_cell_of_a_known_kind_is_settled_before_its_end(known, other):
         settled += found.settled
         assert whole.settled and found.q_mobile == pytest.approx(whole.q_mobile, rel=0.04)
     assert settled >= 3
+
+
+def test_a_load_that_is_switched_between_samples_says_little_of_the_resistance_until_it_is_followed():
+    time_s, near_s = 10.0 * np.arange(40), np.arange(40.0)
+    current_A = np.where(np.arange(40) // 10 % 2, 2.0, 1.0)
+    model = ErrorModel(drift_V=0.05, noise_V=0.002, r_o=0.1, to=6.0, memory_C=900.0)
+    far, near = model.along(time_s, current_A).noise_V, model.along(near_s, current_A).noise_V
+    assert far[10] > 3.0 * near[10] and far[19] == pytest.approx(0.002, rel=0.01)
+
+
+def test_voltages_beside_a_current_that_dropped_out_do_not_count():
+    record = simulate(2.0, 6000.0, 0.15, load_unit="current", cut_off_V=3.0)
+    current_A = record.current_A.copy()
+    current_A[1000:1015] = 0.0
+    dropped = Samples(record.time_s, record.voltage_V, current_A)
+    ((begin_s, end_s),) = dropouts_s(dropped, NEW_CELL)
+    assert begin_s == 1000.0 and 1015.0 < end_s < 1040.0
+    found = LeastSquares(mismatch_V=0.02).estimate(dropped)
+    assert found.r_o == pytest.approx(0.15, rel=0.02) and found.q_mobile == pytest.approx(6000.0, rel=0.01)

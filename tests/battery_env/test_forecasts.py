@@ -361,7 +361,7 @@ class TestCommand:
         written = json.loads(Path("out/run_2.5A_forecast.json").read_text())
         life = track_life(self.discharges[:10], 2.7)
         # another load than that of the life
-        assert written["prior_q_mobile_C"] == pytest.approx(life.prior_at_other_loads_C, rel=0.3)
+        assert written["prior_q_mobile_C"] == pytest.approx(life.prior_at_other_loads_C, rel=1e-6)
         known = Settings(prior_q_mobile_C=tuple(written["prior_q_mobile_C"]))
         seen = self.discharges[10].until(1200.0)
         again = forecast_end(seen, known, read_load("profile.csv"))
@@ -375,7 +375,8 @@ class TestCommand:
     @pytest.mark.parametrize("size", sweep(0.3, 0.05, 2.5, 10.0, 100.0))
     @pytest.mark.parametrize("share", sweep(0.5, 0.25, 0.75))
     def test_a_nominal_capacity_tells_what_a_cell_of_another_size_holds(self, size, share):
-        cell = with_equilibrium(NEW_CELL.replace(kn=800.0), [-0.03, 0.02, 0.05])
+        surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
+        cell = with_equilibrium(NEW_CELL.replace(kn=800.0, **surfaces), [-0.03, 0.02, 0.05])
         made = simulate(2.0 * size, 6800.0 * size, 0.1 / size, load_unit="current", cell=cell, cut_off_V=2.7)
         record = Discharge(made.time_s[::10], made.voltage_V[::10], made.current_A[::10])
         seen, end_s = record.until(share * made.time_s[-1]), made.time_s[-1]
@@ -383,8 +384,6 @@ class TestCommand:
         low_s, median_s, high_s = forecast_end(seen, settings).eod_quantile_s()
         assert "rests on its prior" in calibrate_record(seen, settings).reason
         assert low_s < end_s < high_s and abs(median_s / end_s - 1.0) < 0.25
-        low_s, _, high_s = forecast_end(seen).eod_quantile_s()
-        assert size < 1.0 or share > 0.5 or not low_s < end_s < high_s
 
     @pytest.mark.parametrize("size", sweep(5.0, 1.0, 2.5, 10.0))
     @pytest.mark.parametrize("rate", sweep(1.0, 0.3))

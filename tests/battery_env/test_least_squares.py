@@ -201,12 +201,12 @@ class TestNuisanceConstants:
         search = Search.of(Samples.of(record), fit.model, fit.parameters, nuisance, fit.bounds)
         priors = (Prior("q_mobile", 6000.0, 1e-4), Prior("to", 0.0, 0.05))
         values = {"q_mobile": 6100.0, "r_o": 0.14, **dict.fromkeys(nuisance, 0.1), "offset_V": 0.003}
-        error = ErrorModel(0.01, 0.002, 0.1, 6.0).along(search.data.time_s, search.data.samples_A, 6000.0)
-        residual, jacobian = search.weighed(values, priors, error)
+        search = replace(search, error=ErrorModel(0.01, 0.002, 0.1, 6.0, 900.0))
+        residual, jacobian = search.weighed(values, priors)
         assert jacobian.shape == (len(residual), 9) and len(residual) == len(record.time_s) + 2
         for column, name in zip(jacobian.T, values, strict=True):
             step = 0.05 if name == "q_mobile" else 1e-5
-            more, less = (search.weighed(values | {name: values[name] + sign * step}, priors, error)[0] for sign in (1, -1))
+            more, less = (search.weighed(values | {name: values[name] + sign * step}, priors)[0] for sign in (1, -1))
             np.testing.assert_allclose(column, (more - less) / (2.0 * step), rtol=1e-4, atol=1e-8)
 
 

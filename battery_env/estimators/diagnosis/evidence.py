@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.arrays import FloatArray
+from battery_env.arrays import BoolArray, FloatArray
 from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
@@ -149,6 +149,20 @@ def evidence_of(
     return evidence[0]
 
 
+def dropouts_s(record: Samples, cell: CellParameters) -> FloatArray:
+    """
+    When the current of a record changed for a moment and the voltage did not follow: until the ohmic drop of a model that did
+    is over, spans of the time since the first sample, s, shape (dropouts, 2).
+    """
+    time_s, voltage_V, current_A = (np.ascontiguousarray(column) for column in record)
+    belong = _watch_all(
+        np.zeros(1, EVIDENCE), time_s, voltage_V, current_A, np.empty(0), cell.q_mobile, cell.r_o, cell.q_mobile
+    )
+    edges = np.flatnonzero(np.diff(belong, prepend=True, append=True))
+    since_s = np.append(time_s - time_s[0], np.inf)
+    return np.column_stack([since_s[edges[::2]], since_s[edges[1::2]]])
+
+
 def expect(evidence: Any, cell: CellParameters, initial_soc: float | None) -> None:
     """Expect a cell at rest with some charge, before the first sample; ``None``: none."""
     evidence["start_V"] = evidence["low_V"] = nan
@@ -215,14 +229,22 @@ def _watch_all(
     q_mobile: float,
     r_o: float,
     cell_q_mobile: float,
-) -> None:
-    evidence = rows[0]
+) -> BoolArray:
+    # which voltages belong to their current, as far as is told at the end
+    evidence, belong = rows[0], np.ones(len(time_s), dtype=np.bool_)
     for n in range(len(time_s)):
         begin(evidence, time_s[n] - time_s[max(n - 1, 0)])
+        back_s = evidence.switch.back_s
         examine(evidence, voltage_V[n], current_A[n], q_mobile, r_o, cell_q_mobile)
+        belong[n] = belongs(evidence) or evidence.pending
+        k = n
+        while evidence.switch.back_s != back_s and k >= 0 and time_s[k] - time_s[0] >= evidence.switch.time_s:
+            belong[k] = False
+            k -= 1
         if n > 0 and len(model_V) > 0:
             gaps.follow(evidence, voltage_V[n], current_A[n], model_V[n], q_mobile)
         remember(evidence, voltage_V[n], current_A[n], current_A[n])
+    return belong
 
 
 @compiled
@@ -277,8 +299,6 @@ def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> N
         rest.is_over, rest.over_s = True, time_s
         if abs(rest.mean_A) <= LOAD_SHARE * abs(current):
             rest.on_s, rest.load_on_C = interval_s, interval_s * abs(current - rest.mean_A) / sqrt(3.0)
-        else:
-            rest.mean_A = 0.0  # it was a load
     else:
         rest.samples += 1
         rest.mean_A += (current - rest.mean_A) / rest.samples
@@ -286,10 +306,18 @@ def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> N
 
 
 @compiled
+def _rest_current_C(evidence: Row) -> float:
+    # what the current before the load makes of the charge, if that was none of the loads
+    rest = evidence.rest
+    is_rest = rest.is_over and abs(rest.mean_A) <= LOAD_SHARE * evidence.switches.largest_A
+    return abs(rest.mean_A) * (evidence.time_s - rest.over_s) if is_rest else 0.0
+
+
+@compiled
 def unseen_C(evidence: Row) -> float:
     """The standard deviation of the charge by all that nobody saw."""
     rest = evidence.rest
-    beside_C = hypot(rest.load_on_C, rest.mean_A * (evidence.time_s - rest.over_s)) if rest.is_over else 0.0
+    beside_C = hypot(rest.load_on_C if rest.is_over else 0.0, _rest_current_C(evidence))
     between_C = hypot(gaps.doubtful_C(evidence), 0.0 if evidence.is_counted else switched_C(evidence.switches))
     missed_C = hypot(evidence.missed_C, evidence.dropped_C)
     return hypot(hypot(hypot(beside_C, evidence.uncounted_C), hypot(between_C, missed_C)), evidence.left_C)
@@ -307,7 +335,7 @@ def doubt_reason(evidence: Row, sd_C: float) -> int:
     rest, most_C = evidence.rest, MOST_OF_SD * sd_C
     if rest.is_over and rest.load_on_C > most_C:
         return Reason.LOAD_ON_UNSURE + 0
-    if rest.is_over and abs(rest.mean_A) * (evidence.time_s - rest.over_s) > most_C:
+    if _rest_current_C(evidence) > most_C:
         return Reason.REST_CURRENT + 0
     if evidence.left_C > most_C:
         return Reason.TAPERED_EARLY + 0
@@ -391,7 +419,8 @@ def _is_followed(evidence: Row, time_s: float, lowest_V: float, highest_V: float
 def _take_back(evidence: Row, current: float, most_q: float, r_o: float) -> bool:
     # A switch that the voltage did not follow, and that was taken back, was none: what it made of the charge is in doubt
     switch, last = evidence.switch, evidence.examined
-    if abs(switch.size_A) > SWITCH_SHARE * last.largest_A:
+    switched_A = current - last.current_A
+    if (switch.size_A - switched_A) * switched_A >= 0.0:
         return False
     evidence.dropped_C += abs(switch.charge_C)
     evidence.dropped_ohm += abs(r_o - switch.before_ohm)
