@@ -43,6 +43,7 @@ from benchmarks.study import (
     SYMBOLS,
     Study,
     Tables,
+    add_legend,
     at_most,
     command_line,
     digits,
@@ -90,6 +91,8 @@ _MEASURES = (
 # The mean magnitude of a normal error is this times its standard deviation
 _MEAN_MAGNITUDE = float(np.sqrt(2.0 / np.pi))
 _POLICY_NEEDS = "training on simulated discharges, model"
+# Of published rows whose calibrators are archived
+_ARCHIVED_NEEDS = dict.fromkeys(("greedy one-step cost", "greedy, free-running"), "full state")
 # Of the calibrators in a figure.
 _MARKERS = "osD^vP*X<>"
 # Exact estimates are drawn here
@@ -399,7 +402,8 @@ def summary(results: pd.DataFrame, labels: Sequence[str], needs: Mapping[str, st
 def report(name: str, results: pd.DataFrame) -> str:
     """What readers have to know, and the table."""
     comparison = COMPARISONS[name]
-    table = summary(results, list(comparison.conditions[0].labels), {who.name: who.needs for who in comparison.calibrators})
+    needs = _ARCHIVED_NEEDS | {who.name: who.needs for who in comparison.calibrators}
+    table = summary(results, list(comparison.conditions[0].labels), needs)
     return f"""{comparison.about}
 
 Errors are means over discharges, and (the worst discharge): in the
@@ -445,8 +449,7 @@ def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
         axes.grid(axis="x", alpha=0.25)
     panels[0].set_yticks(list(ticks), ticks.values(), fontsize=8)
     panels[0].set_ylim(y - 1, -1)
-    handles = dict(zip(*panels[0].get_legend_handles_labels()[::-1], strict=True))
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    add_legend(figure, panels[:1], 3)
     return figure
 
 

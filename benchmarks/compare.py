@@ -142,17 +142,16 @@ def report(study: Study) -> None:
     runs = finished_runs(study)
     if runs.empty:
         return
-    rows: dict[tuple[str, ...], list[dict[str, str]]] = {}  # a table for readers for each set of columns
+    shown: dict[tuple[str, ...], list[pd.DataFrame]] = {}  # a table for readers for each set of columns
     tables = []
     for _, of_env in runs.groupby("env"):
-        lines, table = contest_of(of_env["made_by"].iloc[0]["recipe"]["env_id"]).report(of_env, study)
+        for_readers, table = contest_of(of_env["made_by"].iloc[0]["recipe"]["env_id"]).report(of_env, study)
         tables.append(table)
-        for line in lines:
-            rows.setdefault(tuple(line), []).append(line)
+        shown.setdefault(tuple(for_readers), []).append(for_readers)
     together = pd.concat(tables, ignore_index=True)
     if len(together) > 0:
         study.write_table("compare", together, recipes_of(runs))
-    texts = [markdown(lines) for lines in rows.values()]
+    texts = [markdown(pd.concat(of_columns)) for of_columns in shown.values()]
     resumed = runs[runs["resumed"] > 0]
     if len(resumed) > 0:
         said = "Interrupted and continued from a checkpoint, with other random numbers than an uninterrupted run has:\n\n"

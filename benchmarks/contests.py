@@ -31,7 +31,19 @@ from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.full_state.full_state_task import FullStateTask
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.study import EVALUATION_SEED, SYMBOLS, Study, Tables, digits, side_by_side, with_interval, with_spread
+from benchmarks.study import (
+    EVALUATION_SEED,
+    SYMBOLS,
+    Cell,
+    Study,
+    Tables,
+    digits,
+    of_trained,
+    side_by_side,
+    table_of,
+    with_interval,
+    with_spread,
+)
 from benchmarks.training import registered_id
 
 #: What the voltmeter does to the test discharges of voltage-only tasks.
@@ -50,6 +62,13 @@ _SCORED_EPISODES = 100
 HELD_OUT = 300
 #: Columns of runs that no table has: what made a run, and its tables.
 OF_RUN = ["made_by", "tables"]
+_RECIPE: dict[str, Cell] = {
+    "recipe": of_trained(lambda group: group["recipe"].iloc[0]),
+    "steps": of_trained(lambda group: f"{group['timesteps'].iloc[0]:.0f}"),
+    "seeds": of_trained(lambda group: str(len(group))),
+}
+_TRAINING: dict[str, Cell] = {"training (min)": of_trained(lambda group: f"{group['training_minutes'].mean():.1f}")}
+_TIMES: dict[str, Cell] = {"time per estimate (us)": ("time_per_update_us", lambda us: f"{us.mean():.2g}"), **_TRAINING}
 
 
 def held_out_trajectories(env_id: str) -> TrajectoryDataset:
@@ -89,8 +108,8 @@ class Contest(ABC):
         return {"time_per_update_us": 1e6 * float(scores["time_per_update_s"].iloc[0])}
 
     @abstractmethod
-    def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
-        """Write tables and figures of all finished runs in this environment."""
+    def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Write tables and figures of all finished runs in this environment: what readers see, and what goes with others."""
 
     def write_learning(self, runs: pd.DataFrame, study: Study) -> None:
         """Draw each metric during training, and write the curves."""
@@ -165,7 +184,7 @@ class FullState(Calibration):
             tables.append(pd.DataFrame([{**row, "time_per_update_us": 1e6 * float(exact["time_per_update_s"].iloc[0])}]))
         return pd.concat(tables, ignore_index=True)
 
-    def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
+    def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
         self.write_learning(runs, study)
         errors = [f"{prefix}{name}_{self.metric}" for prefix in ("", "start_off_") for name in self.parameters]
         of_runs = {
@@ -182,25 +201,20 @@ class FullState(Calibration):
             columns = ["load", name, f"{name}_hat", f"{name}_spread"]
             points = pd.concat({label: scores[columns] for label, scores in inferred.items()}, names=["algo", "trajectory"])
             study.write_table(f"{stem}_inferred", points.reset_index(), recipes_of(runs))
-        table, lines = self.table(runs), []
-        for (parameter, label), group in table.groupby(["parameter", "label"], sort=False):
-            learned = label != "closed form"
-            lines.append(
-                {
-                    "environment": self.env_id,
-                    "parameter": str(parameter),
-                    **_who(str(label), group, learned),
-                    "MAPE (%)": with_spread(group["mape_percent"]),
-                    "interquartile mean (%)": with_interval(group["mape_percent"]) if len(group) > 1 else "",
-                    "worst discharge (%)": digits(group["mape_worst_percent"].max()),
-                    "MAPE, start off (%)": with_spread(group["start_off_mape_percent"]) if learned else "",
-                    "bias (%)": with_spread(group["bias_percent"]),
-                    "spread (%)": with_spread(group["spread_percent"]),
-                    "end of discharge (%)": with_spread(group["eod_error_percent"]),
-                    **_times(group, learned),
-                }
-            )
-        return lines, table.drop(columns=["label", *OF_RUN])
+        table = self.table(runs)
+        cells: dict[str, Cell] = {
+            **_RECIPE,
+            "MAPE (%)": ("mape_percent", with_spread),
+            "interquartile mean (%)": ("mape_percent", lambda errors: with_interval(errors) if len(errors) > 1 else ""),
+            "worst discharge (%)": ("mape_worst_percent", lambda errors: digits(errors.max())),
+            "MAPE, start off (%)": of_trained(lambda group: with_spread(group["start_off_mape_percent"])),
+            "bias (%)": ("bias_percent", with_spread),
+            "spread (%)": ("spread_percent", with_spread),
+            "end of discharge (%)": ("eod_error_percent", with_spread),
+            **_TIMES,
+        }
+        shown = table_of(table, {"env": "environment", "parameter": "parameter", "label": "calibrator"}, cells)
+        return shown, table.drop(columns=["label", *OF_RUN])
 
 
 class VoltageOnly(Calibration):
@@ -226,7 +240,7 @@ class VoltageOnly(Calibration):
             "Kalman filter": ExtendedKalmanFilter(self.parameters),
         }
 
-    def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
+    def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
         self.write_learning(runs, study)
         who = ["label", "seed", "training_minutes", "tables"]
         tables = [
@@ -241,17 +255,15 @@ class VoltageOnly(Calibration):
         study.write_table(f"{self.env_id}_scores", scores, recipes_of(runs))
         study.write_table(self.env_id, table, recipes_of(runs))
         save_figure(plot_ranks(scores, self.parameters), study.out / f"{self.env_id}.png")
-        lines = []
-        for (sensor, calibrator), group in table.groupby(["sensor", "calibrator"], sort=False):
-            line = {"environment": self.env_id, "sensor": str(sensor), "calibrator": str(calibrator)}
-            for name in self.parameters:
-                symbol = SYMBOLS[name]
-                line[f"{symbol}, second half (%)"] = side_by_side(group[f"{name}_second_half_percent"])
-                line[f"worst discharge (%) {symbol}"] = side_by_side(group[f"{name}_second_half_worst_percent"])
-                line[f"{symbol}, final (%)"] = side_by_side(group[f"{name}_final_percent"])
-            line["end of discharge, at 50 % (%)"] = side_by_side(group["eod_error_at_50_percent"])
-            lines.append({**line, **_times(group, bool(group["training_minutes"].notna().any()))})
-        return lines, pd.DataFrame()
+        cells: dict[str, Cell] = {}
+        for name in self.parameters:
+            symbol = SYMBOLS[name]
+            cells[f"{symbol}, second half (%)"] = (f"{name}_second_half_percent", side_by_side)
+            cells[f"worst discharge (%) {symbol}"] = (f"{name}_second_half_worst_percent", side_by_side)
+            cells[f"{symbol}, final (%)"] = (f"{name}_final_percent", side_by_side)
+        cells["end of discharge, at 50 % (%)"] = ("eod_error_at_50_percent", side_by_side)
+        by = ["environment", "sensor", "calibrator"]
+        return table_of(table.assign(environment=self.env_id), by, cells | _TIMES), pd.DataFrame()
 
     def table(self, scores: pd.DataFrame) -> pd.DataFrame:
         """The scores of all calibrators, over discharges."""
@@ -299,7 +311,7 @@ class Episodes(Contest):
     def summary(self, scores: pd.DataFrame) -> dict[str, Any]:
         return {"time_per_update_us": None}
 
-    def report(self, runs: pd.DataFrame, study: Study) -> tuple[list[dict[str, str]], pd.DataFrame]:
+    def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
         self.write_learning(runs, study)
         scores = [run["scores"] for run in runs["tables"]]
         table = runs.assign(
@@ -310,19 +322,15 @@ class Episodes(Contest):
         study.write_table(
             self.env_id, table.drop(columns=["scores", "label", *OF_RUN, "time_per_update_us"]), recipes_of(runs)
         )
-        lines = [
-            {
-                "environment": self.env_id,
-                **_who(str(label), group, learned=True),
-                "cost of an episode": with_spread(group["cost"]),
-                "return, interquartile mean": with_interval(-group["cost"]),
-                "worst episode": digits(group["cost_worst"].max()),
-                "steps of an episode": with_spread(group["length"]),
-                "training (min)": f"{group['training_minutes'].mean():.1f}",
-            }
-            for label, group in table.groupby("label", sort=False)
-        ]
-        return lines, pd.DataFrame()
+        cells: dict[str, Cell] = {
+            **_RECIPE,
+            "cost of an episode": ("cost", with_spread),
+            "return, interquartile mean": ("cost", lambda costs: with_interval(-costs)),
+            "worst episode": ("cost_worst", lambda costs: digits(costs.max())),
+            "steps of an episode": ("length", with_spread),
+            **_TRAINING,
+        }
+        return table_of(table, {"env": "environment", "label": "algorithm"}, cells), pd.DataFrame()
 
 
 def contest_of(env_id: str) -> Contest:
@@ -332,22 +340,6 @@ def contest_of(env_id: str) -> Contest:
     except ValueError:
         return Episodes(env_id)
     return FullState(env_id) if isinstance(task, FullStateTask) else VoltageOnly(env_id)
-
-
-def _who(label: str, group: pd.DataFrame, learned: bool) -> dict[str, str]:
-    return {
-        "calibrator" if "parameter" in group else "algorithm": label,
-        "recipe": group["recipe"].iloc[0] if learned else "",
-        "steps": f"{group['timesteps'].iloc[0]:.0f}" if learned else "",
-        "seeds": str(len(group)) if learned else "",
-    }
-
-
-def _times(group: pd.DataFrame, learned: bool) -> dict[str, str]:
-    return {
-        "time per estimate (us)": f"{group['time_per_update_us'].mean():.2g}",
-        "training (min)": f"{group['training_minutes'].mean():.1f}" if learned else "",
-    }
 
 
 def plot_ranks(scores: pd.DataFrame, parameters: Sequence[str]) -> Figure:

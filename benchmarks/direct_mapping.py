@@ -44,6 +44,7 @@ from benchmarks.study import (
     digits,
     markdown,
     natural,
+    of_trained,
     positive,
     table_of,
     with_spread,
@@ -266,7 +267,7 @@ def report(results: pd.DataFrame, configuration: Mapping[str, Any]) -> str:
         **{f"{name}_percent": 100.0 * results[name] / results["true"] for name in ("bias", "spread")},
     )
     cells: dict[str, Cell] = {
-        "seeds": lambda group: str(len(seeds(group))) if group["seed"].notna().all() else "",
+        "seeds": of_trained(lambda group: str(len(seeds(group)))),
         "MAPE (%)": lambda group: with_spread(seeds(group)),
         "worst discharge (%)": ("mape_percent", lambda errors: digits(errors.max())),
         "bias (%)": ("bias_percent", lambda biases: f"{biases.mean():+.2g}"),

@@ -25,7 +25,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from scipy.stats import bootstrap
@@ -34,7 +33,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from battery_env.plotting import coloured, draw_over_seeds
 from benchmarks.control import roll_out
 from benchmarks.runs import POINTS, Run, make_rows, rows_command_line, setting_of_lac
-from benchmarks.study import Study, digits, markdown, new_panels, with_interval
+from benchmarks.study import Study, add_legend, digits, markdown, new_panels, with_interval
 
 #: Environment steps of each task, the cheap ones first.
 TASKS = {
@@ -186,7 +185,6 @@ def plot_learning(rows: pd.DataFrame) -> Figure:
     """The return of the mean action while policies are trained: interquartile mean over seeds, in a band of its interval."""
     tasks = list(rows["task"].unique())
     figure, panels = new_panels(len(tasks), 4, (3.1, 2.3), margin=(0.0, 0.4))
-    handles: dict[str, Artist] = {}
     for axes, task in zip(panels, tasks, strict=True):
         of_task = rows[rows["task"] == task]
         for colour, (label, name) in coloured((label, name) for name, (label, _) in ALGORITHMS.items()):
@@ -194,7 +192,6 @@ def plot_learning(rows: pd.DataFrame) -> Figure:
             if len(own):
                 steps = np.array(list(_CURVE)) / 100 * own["timesteps"].iloc[0]
                 draw_over_seeds(axes, steps, own[list(_CURVE.values())], colour, label)
-        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
         axes.set_title(task, fontsize=10)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.25)
@@ -202,8 +199,7 @@ def plot_learning(rows: pd.DataFrame) -> Figure:
         axes.set_ylabel("return")
     for axes in panels[-4:]:
         axes.set_xlabel("environment steps")
-    entries = list(handles.values()), list(handles)
-    figure.legend(*entries, loc="outside lower center", ncols=6, frameon=False, fontsize="small")
+    add_legend(figure, panels, 6)
     return figure
 
 

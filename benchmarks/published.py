@@ -35,6 +35,7 @@ from benchmarks.stabilisation import REFERENCE, Contender, in_order, parts_of, u
 from benchmarks.study import (
     Study,
     Tables,
+    add_legend,
     command_line,
     markdown,
     natural,
@@ -246,7 +247,7 @@ def plot_learning(learning: pd.DataFrame, results: pd.DataFrame) -> Figure:
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     for axes in panels[-2:]:
         axes.set_xlabel("environment steps")
-    _add_legend(figure, panels[0])
+    add_legend(figure, panels[:1], 3)
     return figure
 
 
@@ -260,7 +261,7 @@ def plot_impulses(results: pd.DataFrame) -> Figure:
         _draw(axes, pushed[pushed["environment"] == env_id], "impulse", measure)
         axes.set(title=env_id, xlabel=_IMPULSES[env_id], ylabel=label)
         _set_scale(axes, measure, "y")
-    _add_legend(figure, panels[0])
+    add_legend(figure, panels[:1], 3)
     return figure
 
 
@@ -282,12 +283,8 @@ def plot_changes(results: pd.DataFrame) -> Figure:
         axes.invert_yaxis()
         axes.set(title=env_id, xlabel=label)
         _set_scale(axes, measure, "x")
-    _add_legend(figure, panels[0])
+    add_legend(figure, panels[:1], 3)
     return figure
-
-
-def _add_legend(figure: Figure, axes: Axes) -> None:
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

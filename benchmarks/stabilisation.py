@@ -57,12 +57,14 @@ from benchmarks.study import (
     Cell,
     Study,
     Tables,
+    add_legend,
     command_line,
     count_of,
     digits,
     markdown,
     natural,
     new_panels,
+    of_trained,
     positive,
     share_with_range,
     table_of,
@@ -263,10 +265,6 @@ def in_order(tables: Tables, order: Sequence[str]) -> dict[str, pd.DataFrame]:
 
 def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
     """What policies cost and where they end, without disturbances."""
-
-    def of_trained(said: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
-        return lambda group: "" if group["seed"].isna().all() else said(group)
-
     cells: dict[str, Cell] = {
         "seeds": of_trained(lambda group: str(len(group))),
         "updates": of_trained(lambda group: f"{group['updates'].max():.0f}"),
@@ -366,11 +364,7 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
         axes.set_ylabel("cost per step")
     for axes in panels[-3:]:
         axes.set_xlabel("environment steps")
-    # one entry for each name that any panel has, whichever that is
-    handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    shown = [name for name in STYLES if name in handles]
-    entries = [handles[name] for name in shown], shown
-    figure.legend(*entries, loc="outside lower center", ncols=min(len(shown), 5), fontsize="small")
+    add_legend(figure, panels, 5, STYLES)
     return figure
 
 

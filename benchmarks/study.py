@@ -102,6 +102,14 @@ def new_panels(
     return figure, panels[:n]
 
 
+def add_legend(figure: Figure, panels: Iterable[Axes], columns: int, order: Iterable[str] | None = None) -> None:
+    """A legend below all panels, with one entry for each name that any of them has."""
+    handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    shown = list(handles) if order is None else [name for name in order if name in handles]
+    entries = [handles[name] for name in shown]
+    figure.legend(entries, shown, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
+
+
 def digits(value: float, significant: int = 2) -> str:
     """A number as readers see it: rounded, and never in powers of ten because it is large."""
     if not np.isfinite(value):
@@ -184,6 +192,11 @@ def _said(cells: Mapping[str, Cell], of: Any) -> dict[str, Any]:
         return cell[1](of[cell[0]]) if isinstance(cell, tuple) else cell(of)
 
     return {title: said(cell) for title, cell in cells.items()}
+
+
+def of_trained(said: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
+    """A cell that says nothing of rows without a seed, as of a calibrator or a controller that nobody trained."""
+    return lambda group: "" if group["seed"].isna().all() else said(group)
 
 
 def natural(text: str) -> int:
