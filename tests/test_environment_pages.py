@@ -75,7 +75,6 @@ def test_common_options_are_options_of_all(dataset):
     names = first_cells("battery_env", "Options that all of them take")
     options = {
         "split": "test",
-        "consistency": 0.1,
         "render_mode": "rgb_array",
         "load": "constant",
         "mismatch": 0.1,

@@ -152,7 +152,6 @@ class PolicyEstimator(OnlineEstimator):
         self._drawn_C = 0.0
         self._decisions = 0
         self._now = np.array([self.cell.q_mobile, self.cell.r_o])
-        self._action = np.zeros(len(self.parameters))
         self._constants = self._no_constants
         self._fitted: Fitted | None = None
         self._judge()
@@ -217,12 +216,12 @@ class PolicyEstimator(OnlineEstimator):
         """One decision, on all readings up to the time when it was due."""
         task = self._follow([on_grid(self._samples, self.dt_s)], due * self.decision_s)
         assert isinstance(task, VoltageTask)  # no other follows a stream
-        task.restore(self._now, self._action, self._constants)
+        task.restore(self._now, self._constants)
         self._constants = task.constants[0]
         self._fitted = task.fitted()
         action, _ = self.policy.predict(task.observation(), deterministic=True)
         task.advance(np.asarray(action))
-        self._decisions, self._now, self._action = due, task.estimate[0], np.clip(np.asarray(action)[0], -1.0, 1.0)
+        self._decisions, self._now = due, task.estimate[0]
         self._judge()
 
     def now(self) -> ModelNow:

@@ -181,6 +181,11 @@ class TestPolicies:
 
 
 class TestFiles:
+    @pytest.mark.parametrize(
+        "make",
+        [lambda: ExtendedKalmanFilter(thermal=True), policy_estimator, lambda: policy_estimator(nuisance=0.2, reading_s=5.0)],
+        ids=["filter", "policy", "sure policy"],
+    )
     def test_stopping_and_going_on_changes_nothing(self, make, whole, tmp_path):
         one, other = make(), make()
         record = whole.part(0, 800)

@@ -132,14 +132,6 @@ class TestTask:
         np.testing.assert_allclose(task.observation(), evaluated.observation(), atol=0.05)
         assert np.abs(exact.observation() - evaluated.observation()).max() > 0.2
 
-    def test_consistency_is_charged_and_seen(self, data):
-        plain, task = started(data), started(data, consistency=2.0)
-        assert task.observation_size == plain.observation_size + 2
-        np.testing.assert_array_equal(task.observation()[:, -2:], 0.0)
-        for action, change in ((np.full((4, 2), 0.3), 0.3 * np.sqrt(2.0)), (np.full((4, 2), -0.1), 0.4 * np.sqrt(2.0))):
-            np.testing.assert_allclose(task.advance(action), plain.advance(action) + 2.0 * change)
-            np.testing.assert_array_equal(task.observation()[:, -2:], action.astype(np.float32))
-
     @pytest.mark.parametrize("parameters", [("q_mobile",), ("r_o",), BOTH])
     def test_the_error_of_the_state_is_that_of_the_parameters(self, data, parameters):
         task, by_misfit = (started(data, parameters=parameters, cost=cost) for cost in ("state", "misfit"))
@@ -173,7 +165,6 @@ class TestTask:
             ({"process_noise_V": np.nan}, "process_noise_V must be .*, got nan"),
             ({"start": "new"}, "start must be one of .*, got 'new'"),
             ({"measured": "voltage"}, "measured must be one of .*, got 'voltage'"),
-            ({"consistency": np.inf}, "consistency must be .*, got inf"),
             ({"nuisance": -0.1}, "nuisance must be finite and at least 0, got -0.1"),
             ({"cell": {"kn": 1.0}}, "cell must be CellParameters or None"),
             ({"load": "constant"}, "dataset stands in place of load"),

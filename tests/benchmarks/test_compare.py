@@ -19,6 +19,7 @@ from battery_env import ClosedForm, evaluate
 from benchmarks import compare, contests
 from benchmarks.study import write_json
 from benchmarks.training import Recipe, finished_model, made_by, record_file
+from tests.sweeps import sweep
 
 ENV_ID = "BatteryRo-v0"
 ROOT = Path(__file__).parents[2]
@@ -185,7 +186,7 @@ def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, caps
     }
 
 
-@pytest.mark.parametrize("algo", ["lac", "td3"])
+@pytest.mark.parametrize("algo", sweep("lac", "td3"))
 def test_defaults_are_the_line_as_typed(algo, tmp_path, monkeypatch):
     captured = []
     monkeypatch.setattr(

@@ -6,6 +6,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.metric_sac import MetricSAC
 from sb3_lac import compiled
+from tests.sweeps import sweep
 
 ENV_ID = "LinearCost-v0"
 
@@ -40,7 +41,7 @@ def test_actor_lowers_the_value_itself():
     assert model._objective(th.tensor([[2.0], [-1.0]])).item() == pytest.approx((16 - 1) / 2)
 
 
-@pytest.mark.parametrize("compile_update", [False, True])
+@pytest.mark.parametrize("compile_update", sweep(False, True))
 def test_multiplier_stays_where_it_is(compile_update, monkeypatch, tmp_path):
     monkeypatch.setattr(compiled, "BACKEND", "eager")
     model = make_model(compile_update=compile_update, lambda_init=0.5)

@@ -102,11 +102,9 @@ def test_the_seed_decides_everything(tmp_path):
 
 
 def test_hyperparameters_are_those_of_zoo_configs_where_none_are_given(tmp_path):
-    default = train(25, tmp_path / "default")
-    assert (default.alpha3, default.batch_size, default.policy_kwargs["net_arch"]) == (0.7, 8, [8])
-    other = train(25, tmp_path / "other", hyperparameters={"alpha3": 0.2, "lambda_max": 5.0})
-    assert (other.alpha3, other.lambda_max) == (0.2, 5.0)
-    assert (other.batch_size, other.policy_kwargs["net_arch"]) == (8, [8])
+    recipe = training.Recipe.of("lac", ENV_ID, 0, hyperparameters={"alpha3": 0.2, "lambda_max": 5.0})
+    model = training.set_up(recipe, tmp_path)[1]
+    assert (model.alpha3, model.lambda_max, model.batch_size, model.policy_kwargs["net_arch"]) == (0.2, 5.0, 8, [8])
 
 
 def test_a_recipe_names_all_that_a_policy_depends_on(tmp_path, monkeypatch):
@@ -175,7 +173,7 @@ def test_compilation_is_no_part_of_the_recipe(tmp_path, monkeypatch, trainings):
 def test_an_algorithm_may_name_whose_settings_it_has(tmp_path):
     recipe = training.Recipe.of("benchmarks.metric_sac:MetricSAC", ENV_ID, 0)
     assert recipe.hyperparameters == training.Recipe.of("lac", ENV_ID, 0).hyperparameters
-    assert train(25, tmp_path, recipe.algo).alpha3 == 0.7
+    assert training.set_up(recipe, tmp_path)[1].alpha3 == 0.7
     # of this package only the file that is named counts
     source = Path(training.__file__).with_name("metric_sac.py")
     assert recipe.packages["benchmarks.metric_sac"] == digest_of({source.name: sha256(source.read_bytes()).hexdigest()})

@@ -21,6 +21,7 @@ from torch._functorch.aot_autograd import make_boxed_func
 from torch.torch_version import TorchVersion
 
 from sb3_lac import LAC, PublishedLAC, compiled
+from tests.sweeps import sweep
 
 
 @pytest.fixture(autouse=True)
@@ -98,18 +99,20 @@ def seen(env):
     "kwargs",
     [
         SCHEDULES,
-        {"ent_coef": 0.2, "reward_bound": 3.0, "n_steps": 3},
-        {"algorithm": PublishedLAC, "reward_bound": 3.0, "critic_learning_rate": LinearSchedule(1e-2, 1e-3, 1.0)},
-        {"algorithm": PublishedLAC, "horizon": 4, "ent_coef": 0.2},
-        {
-            "policy_kwargs": {
-                **{"net_arch": [16, 16], "n_critics": 2},
-                **{"optimizer_class": th.optim.SGD, "share_features_extractor": True},
-            }
-        },
-        {"policy": "MultiInputPolicy", "wrapper": seen},
+        *sweep(
+            {"algorithm": PublishedLAC, "reward_bound": 3.0, "critic_learning_rate": LinearSchedule(1e-2, 1e-3, 1.0)},
+            {"algorithm": PublishedLAC, "horizon": 4, "ent_coef": 0.2},
+            {"ent_coef": 0.2, "reward_bound": 3.0, "n_steps": 3},
+            {
+                "policy_kwargs": {
+                    **{"net_arch": [16, 16], "n_critics": 2},
+                    **{"optimizer_class": th.optim.SGD, "share_features_extractor": True},
+                }
+            },
+            {"policy": "MultiInputPolicy", "wrapper": seen},
+        ),
     ],
-    ids=["schedules", "n_steps", "published", "horizon", "two_critics", "images_and_discrete"],
+    ids=["schedules", "published", "horizon", "n_steps", "two_critics", "images_and_discrete"],
 )
 def test_compiled_and_eager_updates_are_the_same(make_model, make_env, kwargs):
     kwargs = kwargs.copy()

@@ -15,6 +15,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from sb3_lac import LAC
+from tests.sweeps import sweep
 
 
 class Priced(gym.Wrapper):
@@ -144,9 +145,9 @@ def test_the_environment_is_not_blamed_for_an_action(make_model):
         make_model(action_noise=noise)
 
 
-@pytest.mark.parametrize("wrapper", [None, in_dict])
+@pytest.mark.parametrize("wrapper", sweep(None, in_dict))
 @pytest.mark.parametrize("normalized", [False, True])
-@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("number", sweep(float("nan"), float("inf"), -float("inf")))
 @pytest.mark.parametrize("where", ["first observation", "observation", "last observation", "reward"])
 def test_what_is_not_finite_is_refused_before_it_is_stored(make_model, make_env, where, number, normalized, wrapper):
     env = make_vec_env(lambda: Spoilt(make_env(), where, number), 1, wrapper_class=wrapper)

@@ -1,6 +1,7 @@
 """The networks of LAC nearly learn what is known exactly, the value of the linear-quadratic regulator."""
 
 import numpy as np
+import pytest
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
@@ -22,6 +23,7 @@ class LinearActor(nn.Module):
         return self(states), th.zeros(len(states))
 
 
+@pytest.mark.attacks
 def test_critic_networks_learn_the_exact_value_of_a_policy(make_model_without_env, train_metrics):
     env = LinearCostEnv(noise_std=0.0)
     rng, n_rounds = np.random.default_rng(0), 10

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_lac import LAC
+from tests.sweeps import sweep
 
 
 def test_lambda_does_not_wind_up(make_model, train_metrics):
@@ -47,13 +48,13 @@ def sure_or_by_chance(actions, rng):
 
 @pytest.mark.parametrize(
     ("costs_of_actions", "low", "high"),
-    [
+    sweep(
         # The states that steps lead to are terminal: an actor that learns there only would learn nothing. Five seeds reached
         # 0.43 to 0.56, and began within 0.1 of 0
         (near_a_half, 0.25, 0.75),
         # The price of a root, which docs/how_lac_works.md states: 1 % of 300 seems less than a sure 1
         (sure_or_by_chance, -1.0, -0.3),
-    ],
+    ),
 )
 def test_episodes_of_one_step_are_learned_and_a_chance_of_a_dear_event_is_underrated(
     make_model_without_env, costs_of_actions, low, high

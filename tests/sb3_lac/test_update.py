@@ -9,6 +9,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_lac import LAC, PublishedLAC, evaluate_lyapunov
 from tests.sb3_lac.equations import mlp, policy_sample
+from tests.sweeps import sweep
 
 GAMMA, TAU, LEARNING_RATE, LAMBDA_LEARNING_RATE, ALPHA3 = 0.9, 0.05, 1e-2, 2e-2, 0.3
 LAMBDA_MIN, LAMBDA_MAX = 0.1, 1.0
@@ -208,7 +209,7 @@ def changed(model, how, tmp_path, **rates):
     return loaded
 
 
-@pytest.mark.parametrize("how", ["attribute", "argument", "custom_objects"])
+@pytest.mark.parametrize("how", sweep("argument", "attribute", "custom_objects"))
 @pytest.mark.parametrize(
     ("algorithm", "rates", "expected"),
     [
@@ -277,7 +278,10 @@ def test_no_gradient_step_changes_nothing(make_model, train_metrics):
 
 @pytest.mark.parametrize(
     ("algorithm", "kwargs"),
-    [(LAC, {}), (PublishedLAC, {"critic_learning_rate": 3e-3}), (PublishedLAC, {"critic_learning_rate": 3e-3, "horizon": 5})],
+    [
+        (LAC, {}),
+        *sweep((PublishedLAC, {"critic_learning_rate": 3e-3}), (PublishedLAC, {"critic_learning_rate": 3e-3, "horizon": 5})),
+    ],
 )
 def test_it_learns_to_control(make_model, make_env, algorithm, kwargs):
     def mean_cost():

@@ -96,7 +96,6 @@ class VoltageTask(CalibrationTask):
         new_readings: tuple[int, int] = (0, 29),
         process_noise_V: float = 0.0,
         start: Literal["random", "new_cell", "true"] = "random",
-        consistency: float = 0.0,
         cost: Cost = "misfit",
         load: LoadKind = "piecewise",
         split: Split = "train",
@@ -110,7 +109,7 @@ class VoltageTask(CalibrationTask):
     ) -> None:
         self.parameters = check_parameters(parameters)
         check_counts(episode_steps=episode_steps)
-        check_not_negative(consistency=consistency, process_noise_V=process_noise_V, nuisance=nuisance)
+        check_not_negative(process_noise_V=process_noise_V, nuisance=nuisance)
         if not 0 <= new_readings[0] <= new_readings[1]:
             raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
         if start not in ("random", "new_cell", "true"):
@@ -128,7 +127,7 @@ class VoltageTask(CalibrationTask):
         self._open(dataset, reading_s, cell, path, chosen)
         self.cells, self.new_readings, self.episode_steps = cells, new_readings, episode_steps
         self.sensors = replace(SENSORS, **sensors)
-        self.process_noise_V, self.first_estimate, self.consistency = process_noise_V, start, consistency
+        self.process_noise_V, self.first_estimate = process_noise_V, start
         self.decision_s = self.readings.interval_s * (sum(new_readings) / 2.0)
         self._set_scales()
         self._cost = cost
@@ -138,7 +137,7 @@ class VoltageTask(CalibrationTask):
                 f"cost='state' is the error of a state that only a simulation knows, and {is_unknown.sum()} of "
                 f"{len(is_unknown)} discharges are not simulated: take cost='misfit' for recorded ones"
             )
-        self.observation_size = 6 * STRETCHES + 4 + len(self.parameters) * (1 + (consistency > 0.0))
+        self.observation_size = 6 * STRETCHES + 4 + len(self.parameters)
         self.path, self._fit = path, None
         if nuisance > 0.0 or path is not None:
             prior = (
@@ -200,7 +199,6 @@ class VoltageTask(CalibrationTask):
         self._step_of_episode: IntArray = np.zeros(cells, dtype=np.int64)
         self._last_step: IntArray = np.zeros(cells, dtype=np.int64)
         self._estimate = np.tile(self._new, (cells, 1))
-        self._action = np.zeros((cells, len(self.parameters)))
         self._shown = np.zeros((SENSOR_ROWS, cells, longest))
         # of the residual, V, of dV/dq_mobile, V/C, and of the ohmic drop per ohm, A
         self._means = np.zeros((3, cells, STRETCHES, 2))
@@ -259,7 +257,6 @@ class VoltageTask(CalibrationTask):
             self._step_of_episode[row] = 0
             self._place(row, n, count, estimate)
             self._measure(row, n, generator)
-        self._action[rows] = 0.0
         self._explain(rows)
 
     def _due(self, discharge: int, every_s: float) -> IntArray:
@@ -351,9 +348,9 @@ class VoltageTask(CalibrationTask):
         self._offset_V = np.clip(residual_V.mean(axis=(1, 2)), -self.sensors.offset_V, self.sensors.offset_V)
         self._misfit_V = np.sqrt(np.mean((residual_V - self._offset_V[:, None, None]) ** 2, axis=(1, 2)))
 
-    def restore(self, estimate: FloatArray, action: FloatArray, constants: FloatArray) -> None:
-        """Let all cells stand where a policy left off: at its estimate, C and ohm, its last action, and :attr:`constants`."""
-        self._estimate[:], self._action[:] = estimate, action
+    def restore(self, estimate: FloatArray, constants: FloatArray) -> None:
+        """Let all cells stand where a policy left off: at its estimate, C and ohm, and :attr:`constants`."""
+        self._estimate[:] = estimate
         if self._fit is not None:
             self._fit.constants[:] = constants
         self._explain()
@@ -385,7 +382,6 @@ class VoltageTask(CalibrationTask):
             np.arcsinh(residual_V.mean(axis=(1, 2)) / _MISFIT_SCALE_V)[:, None],
             (self._time_s / _TIME_SCALE_S)[:, None],
             self._scaled(self._estimate),
-            *([self._action] if self.consistency > 0.0 else []),
             *([] if self._fit is None else self._fit.parts(self._step, self._high - self._low)),
         ]
 
@@ -394,8 +390,7 @@ class VoltageTask(CalibrationTask):
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """Move the estimates, let new readings arrive, and compare all data so far with the model."""
-        chosen = checked_action(action, self._action.shape)
-        step = np.clip(chosen, -1.0, 1.0)
+        step = np.clip(checked_action(action, (self.cells, len(self.parameters))), -1.0, 1.0)
         if self._fit is not None and self.path is not None:
             moved = self._fit.beside(self._estimate, FURTHEST_SD * step)
         else:
@@ -403,10 +398,8 @@ class VoltageTask(CalibrationTask):
         self._estimate[:, self._columns] = np.clip(moved, self._low, self._high)
         self._arrive()
         self._explain()
-        cost = np.arcsinh(self._state_error() / _STATE_COST_SCALE if self._cost == "state" else self._misfit_V / _COST_SCALE_V)
-        cost += self.consistency * np.linalg.norm(step - self._action, axis=1)
-        self._action = step
-        return cost
+        error = self._state_error() / _STATE_COST_SCALE if self._cost == "state" else self._misfit_V / _COST_SCALE_V
+        return np.asarray(np.arcsinh(error))
 
     def _state_error(self) -> FloatArray:
         # relative: at a given current the charges are linear in q_mobile, and the ohmic drop is linear in r_o
