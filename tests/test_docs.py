@@ -10,6 +10,7 @@ import pytest
 
 from battery_env.__main__ import calibrate, main
 from battery_env.estimators.reasons import Reason
+from sb3_lac.stability import fitting
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -75,6 +76,7 @@ def run_briefly(source, name, folder, monkeypatch):
     """Run an example in an empty folder, with few training steps, episodes, discharges and cells instead of thousands."""
     monkeypatch.chdir(folder)
     if ".learn(" in source:  # then it prints other numbers anyway
+        monkeypatch.setattr(fitting, "N_ITERATIONS", 20)
         source = re.sub(r"(fit_life\(load_nasa_discharges\(\"\w+\"\))\)", r"\1[::20])", source)
         source = re.sub(r"\.along\(path, \d+", ".along(path, 20", source)
     source = re.sub(r"\.learn\((total_timesteps=)?[\d_.e]+", r".learn(\g<1>150", source)

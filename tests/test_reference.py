@@ -13,6 +13,7 @@ import pytest
 import battery_env
 import sb3_lac.envs
 import sb3_lac.stability
+from sb3_lac.stability import fitting
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = [DOCS.parent / "README.md", *(page for page in sorted(DOCS.rglob("*.md")) if "results" not in page.parts)]
@@ -87,5 +88,6 @@ def test_what_users_call_first_has_an_example(name):
 @pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if "import " in example])
 def test_whole_examples_of_docstrings_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(fitting, "N_ITERATIONS", 20)
     brief = re.sub(r"\.learn\([\d_]+", ".learn(150", EXAMPLES[name])  # a few training steps instead of thousands
     exec(compile(brief, name, "exec"), {})

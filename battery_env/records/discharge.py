@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, field, fields
 from datetime import datetime, timedelta
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib.resources import as_file, files
 from math import hypot
 from numbers import Real
@@ -369,7 +369,7 @@ def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
     :raises ValueError: if the file is laid out in another way
     """
     if path_or_cell in BUNDLED_CELLS:
-        return _bundled(str(path_or_cell))
+        return [each._derived(meta=dict(each.meta)) for each in _bundled(str(path_or_cell))]
     path = Path(path_or_cell)
     if not path.is_file():
         raise FileNotFoundError(f"no file {str(path)!r}; the cells that come with the package are {', '.join(BUNDLED_CELLS)}")
@@ -386,6 +386,7 @@ def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
     return discharges
 
 
+@lru_cache
 def _bundled(cell: str) -> list[Discharge]:
     with as_file(files("battery_env.records.nasa_cells")) as folder:
         samples = pd.read_csv(folder / f"{cell}_discharge.csv.gz", usecols=["cycle", *_COLUMNS, "temperature_C"])

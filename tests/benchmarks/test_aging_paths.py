@@ -1,12 +1,14 @@
 """The study of ageing paths."""
 
 import pandas as pd
+import pytest
 
 from battery_env import PolicyEstimator, fit_life, load_nasa_discharges
 from battery_env.policies.pretrained import policy_of_file
 from benchmarks import aging_paths
 
 
+@pytest.mark.attacks
 def test_few_discharges_of_one_cell_make_its_tables_and_the_policy(tmp_path, monkeypatch):
     monkeypatch.setattr(aging_paths, "CELLS", {"B0005": "B0006"})
     for name, value in {"SHARES": (0.5, 1.0), "UPDATES": 8, "TRAINING_CELLS": 20, "BUNDLED_CELLS": ("B0006",)}.items():

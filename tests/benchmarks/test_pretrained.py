@@ -38,6 +38,7 @@ def few(parameters, mismatch):
     return TrajectoryDataset.generate(parameters, 2, RandomPiecewise(), seed=0, mismatch=mismatch, **ranges)
 
 
+@pytest.mark.attacks
 def test_it_writes_policies_with_their_cards_and_those_for_recorded_cells_beside_them(train_briefly, tmp_path, capsys):
     arguments = [*"--envs BatteryVoltageJoint-v0 --updates 100 --discharges 2 --jobs 1 --out".split(), str(tmp_path)]
     pretrained.main(arguments)

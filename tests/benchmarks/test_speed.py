@@ -99,6 +99,7 @@ def test_environments_and_filters_are_raced_and_written(monkeypatch, tmp_path, c
     assert "| progpy, unscented Kalman filter" in shown and "1.00 (1.00 to 1.00)" in shown
 
 
+@pytest.mark.attacks
 def test_updates_are_raced_and_written(tmp_path, capsys, monkeypatch):
     pytest.importorskip("sbx")
     # where no GPU is, the processor stands for it

@@ -8,16 +8,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-import torch._dynamo as dynamo
-import torch._inductor.config as inductor
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
-from torch._dynamo.backends.common import aot_autograd
-from torch._functorch.aot_autograd import make_boxed_func
 from torch.torch_version import TorchVersion
 
 from sb3_lac import LAC, PublishedLAC, compiled
@@ -119,11 +115,11 @@ def test_compiled_and_eager_updates_are_the_same(make_model, make_env, kwargs):
     kwargs["env"] = kwargs.pop("wrapper", lambda env: env)(make_env())
     eager, eager_logged = trained(make_model(**kwargs))
     model = make_model(compile_update=True, **kwargs)
-    dynamo.utils.counters.clear()
+    th._dynamo.utils.counters.clear()
     # Neither a schedule nor the next call of ``train()`` is a reason to compile again
-    with dynamo.config.patch(error_on_recompile=True):
+    with th._dynamo.config.patch(error_on_recompile=True):
         _, logged = trained(model)
-    assert dynamo.utils.counters["stats"]["unique_graphs"] == 1
+    assert th._dynamo.utils.counters["stats"]["unique_graphs"] == 1
     for values, eager_values in zip(logged, eager_logged, strict=True):
         assert values == pytest.approx(eager_values, rel=1e-4, abs=1e-5)
     assert_close(model, eager)
@@ -159,6 +155,9 @@ def test_constants_may_change(make_model):
 
 def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
     """CUDA graphs change tensors where they are, but no samples, need no value on the CPU, and have one output."""
+    from torch._dynamo.backends.common import aot_autograd  # seconds, which others that are tested here do without
+    from torch._functorch.aot_autograd import make_boxed_func
+
     graphs = []
 
     def compiler(graph, inputs):
@@ -249,10 +248,12 @@ def test_missing_compiler_is_noticed_before_the_first_step(make_model, monkeypat
     ],
 )
 def test_compiled_code_makes_the_same_updates(device, make_model, monkeypatch):
+    from torch._inductor import config
+
     kwargs = {"device": device, "policy_kwargs": {"net_arch": [4], "optimizer_class": th.optim.SGD}}
     monkeypatch.setattr(compiled, "BACKEND", "inductor")
     eager, _ = trained(make_model(**kwargs))
     # Otherwise compiled code has random numbers of its own
-    with inductor.patch(fallback_random=True):
+    with config.patch(fallback_random=True):
         model, _ = trained(make_model(compile_update=True, **kwargs))
     assert_close(model, eager)

@@ -62,6 +62,7 @@ def test_its_steps_are_those_of_lac(make_model_without_env, train_metrics, singl
     th.testing.assert_close(found, after, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.attacks
 def test_it_learns_the_linear_problem(single_file):
     untrained, trained = (single_file["main"](n_steps=n_steps) for n_steps in (1, 1_500))
     assert trained < 0.2 * untrained

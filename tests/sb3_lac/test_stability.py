@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, sync_env
 from sb3_lac import LAC, CertificateCallback, LyapunovCallback, certify, evaluate_lyapunov
 from sb3_lac.stability import fitting, rollout, statistics
 from sb3_lac.stability.statistics import Bootstrap, decrease_by_cost, exact_percentile, ratio
+from tests.sweeps import sweep
 
 RHO = 0.5
 
@@ -170,7 +171,7 @@ def test_ends_of_episodes(make_exact_model):
     assert report.by_cost["n_transitions"].sum() == 4
 
 
-@pytest.mark.parametrize("n", [2, 71, 72])
+@pytest.mark.parametrize("n", sweep(72, 2, 71))
 def test_interval_of_a_percentile_covers_it(n):
     rng = np.random.default_rng(0)
     intervals = np.array([exact_percentile(rng.exponential(size=n), 95) for _ in range(300)])
