@@ -11,6 +11,7 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_lac import LAC, PublishedLAC, buffers
+from tests.sweeps import sweep
 
 
 def sizes_of_samples(model, monkeypatch, gradient_steps):
@@ -89,7 +90,7 @@ class Weighted(ReplayBuffer):
         return SimpleNamespace(**self._get_samples(rows, env)._asdict(), **own)
 
 
-@pytest.mark.parametrize("compile_update", [False, True])
+@pytest.mark.parametrize("compile_update", sweep(False, True))
 @pytest.mark.parametrize("algorithm", [LAC, PublishedLAC])
 def test_samples_may_be_any_object_with_other_parts(make_model, n_updates, monkeypatch, algorithm, compile_update):
     monkeypatch.setattr("sb3_lac.compiled.BACKEND", "eager")

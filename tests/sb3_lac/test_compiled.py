@@ -1,6 +1,5 @@
 """An update as one compiled graph makes the numbers of the update that it was compiled from."""
 
-import copy
 import pickle
 import shutil
 
@@ -187,7 +186,7 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
 def test_saved_models_go_on_compiled_or_not(make_model, tmp_path):
     model, _ = trained(make_model(compile_update=True, **SCHEDULES), calls=1)
     model.save(tmp_path / "compiled")
-    going_on = [model, pickle.loads(pickle.dumps(model)), copy.deepcopy(model)]
+    going_on = [model, pickle.loads(pickle.dumps(model))]
     for compile_update in (False, True):
         loaded = LAC.load(tmp_path / "compiled", device="cpu", compile_update=compile_update)
         assert loaded.critic.optimizer.param_groups[0]["fused"] is True
