@@ -18,7 +18,6 @@ from torch import nn
 
 from sb3_lac import LAC, CertificateCallback, DashboardCallback, LyapunovCallback
 from sb3_lac.dashboard import CHARTS, hyperparameters_of
-from sb3_lac.stability import fitting
 
 CALIBRATION = {"Calibration": {"MAPE (%)": ["Multiline", ["calibration/mape_percent$"]]}}
 OPTIONS = {"learning_starts": 8, "batch_size": 4, "buffer_size": 100, "seed": 0, "device": "cpu"}
@@ -30,13 +29,6 @@ def make_env():
 
 def make_model(algorithm, **options):
     return algorithm("MlpPolicy", make_env(), policy_kwargs={"net_arch": [4]}, **OPTIONS, **options)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _few_iterations():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitting, "N_ITERATIONS", 2)
-        yield
 
 
 @pytest.fixture(scope="module")
