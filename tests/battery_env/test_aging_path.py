@@ -342,6 +342,7 @@ class TestTask:
         task.advance(np.tile([0.25, -0.5], (4, 1)))
         np.testing.assert_allclose(task.estimate, np.clip(fitted.estimate + [0.5, -1.0] * fitted.sd, low, high))
 
+    @pytest.mark.attacks
     def test_intervals_along_the_path_hold(self, path):
         data = TrajectoryDataset.along(path, 60, [constant(1.5, "current"), LOAD], seed=7)
         estimator = PolicyEstimator(FIT, "BatteryVoltageJoint-v0", path=path)
