@@ -278,10 +278,10 @@ def test_no_gradient_step_changes_nothing(make_model, train_metrics):
 
 @pytest.mark.parametrize(
     ("algorithm", "kwargs"),
-    [
+    sweep(
         (LAC, {}),
-        *sweep((PublishedLAC, {"critic_learning_rate": 3e-3}), (PublishedLAC, {"critic_learning_rate": 3e-3, "horizon": 5})),
-    ],
+        *((PublishedLAC, {"critic_learning_rate": 3e-3, "horizon": horizon}) for horizon in (None, 5)),
+    ),
 )
 def test_it_learns_to_control(make_model, make_env, algorithm, kwargs):
     def mean_cost():
