@@ -80,7 +80,7 @@ def test_calibrates_a_bundled_discharge_and_writes_what_it_found(tmp_path, termi
     shown = terminal.shows("B0005:100", "--out", folder)
     assert "settled" in shown and "yes" in shown and "measured at" in shown and "remaining" not in shown
     assert "1.486 Ah   the capacity to 2.7 V" in shown and "state of health" not in shown
-    assert "40.3 degC   measured; the model goes from 24.3 degC to 26.5 degC" in shown
+    assert "40.3 degC   measured; the model goes from 24.3 degC to 26.6 degC" in shown
     kinds = ("estimate.csv", "estimate.parquet", "voltage.csv", "voltage.png")
     assert names_in(folder) == {f"B0005_100_{kind}" for kind in (*kinds, "estimate.jsonl")}
     (row,) = pd.read_csv(folder / "B0005_100_estimate.csv").to_dict(orient="records")
