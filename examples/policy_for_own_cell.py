@@ -1,6 +1,7 @@
 """
 Train a policy for cells that age as a cell of your own did: on simulations along its recorded life. Some minutes.
 
+It needs both packages, and ``pip install '.[onnx]'`` for the file that runs without torch.
 It writes ``mine.onnx`` and ``path.json``, for ``PolicyEstimator(OnnxPolicy("mine.onnx"), ..., path="path.json")``.
 """
 
