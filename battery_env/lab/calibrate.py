@@ -31,6 +31,7 @@ from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.lab.forecast import Forecast, forecast
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable, read_recordings
+from battery_env.lab.readers.testers import Tester, find_tester
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings, SettingsOptions
 from battery_env.lab.sources import find_sources, read_source
@@ -63,6 +64,7 @@ class Options(SettingsOptions, total=False):
     units: Mapping[str, str] | None
     discharge_is_negative: bool | None
     ignore: Collection[str]
+    tester: str | Path | Tester | None
 
 
 @overload
@@ -94,7 +96,7 @@ def calibrate(
         what the command takes: a folder, ``"life.csv:2"``, or a bundled cell, as ``"B0005:100"``
     :param settings: how to look at them; ``None``: as ``options`` say
     :param options: of :class:`Settings`, by name: ``cut_off_V``, ``nominal_Ah``, ``initial_soc``, ...; ``cell`` may be what
-        ``fit_cell`` found. Of tables and files what ``read_discharges`` takes, too, but the tester
+        ``fit_cell`` found. Of tables and files what ``read_discharges`` takes, too
     :return: what a discharge says; of other sources a list, without what cannot be used, of which warnings say why
     :raises ValueError: if none can be used
     :raises TypeError: for an option that there is not
@@ -107,7 +109,7 @@ def calibrate(
     settings = Settings.for_cell(**options) if settings is None else replace(settings, **options)
     if isinstance(source, Discharge):
         return calibrated(source, settings)
-    file_format = FileFormat(**of_file)
+    file_format = FileFormat(**of_file | {"tester": find_tester(of_file.get("tester"))})
     sources = find_sources([os.fspath(source)]) if isinstance(source, str | os.PathLike) else []
     readers = {each.argument: partial(read_source, each, file_format) for each in sources}
     return each_usable(

@@ -30,7 +30,7 @@ from battery_env.estimators.search import spread_over
 from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.lab.batch import VERSION, Outcome, Results, calibrate_all, interruptible, workers
 from battery_env.lab.page_server import serve
-from battery_env.lab.readers.columns import FileFormat, description, recognise
+from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.readers.testers import find_tester, tester_file
 from battery_env.lab.report import CALIBRATED_BY, line_of, text_of
@@ -540,7 +540,7 @@ def columns(arguments: Sequence[str] | None = None, name: str = "python -m batte
     with _saying():
         opened = open_file(options.record, file_format)
         found = recognise(opened.names, file_format, opened.rows)
-    print(description(opened.names, opened.rows, found))
+    print("\n".join(found.lines()))
     with replacing(options.out, new=True) as part:
         part.write_text(tester_file(found.columns, opened.names, opened.rows), encoding="utf-8")
     then = "Fill in what is not found" if found.missing else "Change what is wrong"

@@ -15,7 +15,7 @@ from plotly.colors import qualitative
 from battery_env.lab.batch import attempt
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.life import Life
-from battery_env.lab.readers.columns import FileFormat, description, recognise
+from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.discharges import Recording
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.report import Calibration
@@ -92,7 +92,7 @@ def recognised_of(path: Path, file_format: FileFormat) -> tuple[str, list[str], 
     """Name and columns of a file, and what is recognised of them."""
     opened = open_file(path, file_format)
     found = recognise(opened.names, FileFormat(), opened.rows)
-    return path.name, list(dict.fromkeys(filter(None, opened.names))), description(opened.names, opened.rows, found)
+    return path.name, list(dict.fromkeys(filter(None, opened.names))), "\n".join(found.lines())
 
 
 def read(paths: list[str], file_format: FileFormat, troubles: list[str]) -> list[tuple[Source, Recording]]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from unicodedata import normalize
 
 from battery_env.checks import ZERO_CELSIUS_K
-from battery_env.lab.readers.testers import QUANTITIES, REQUIRED, TESTERS, Tester
+from battery_env.lab.readers.testers import BESIDE, QUANTITIES, REQUIRED, TESTERS, Tester
 
 #: What may stand in the place of a quantity that a record must have.
 INSTEAD = {"time": ("date", "step_time"), "current": ("power", "charge_step")}
@@ -112,19 +112,47 @@ class Recognised(NamedTuple):
     tester: Tester
     columns: dict[str, Column]  # by quantity; what may serve as well has a number, as ``time 2``
     missing: list[str]  # quantities that a record must have
+    names: Sequence[str]  # all of the table
+    rows: Sequence[Sequence[str]]  # fields of its first rows
+    source: str
+
+    def unused(self) -> list[str]:
+        """Names of the columns that are not used."""
+        used = {column.position for column in self.columns.values()}
+        return [name for n, name in enumerate(self.names) if name and n not in used]
+
+    def lines(self) -> list[str]:
+        """What the table begins with, and what is known of it."""
+        told = {"header": ", ".join(self.names)}
+        told |= {f"row {n}": ", ".join(row) for n, row in enumerate(self.rows[:2], start=1)}
+        told |= {"tester": self.tester.name} | {key: shown(column) for key, column in self.columns.items()}
+        told |= {each: "not found" for each in self.missing} | {"not used": ", ".join(self.unused())}
+        return [f"{key:<12}{shortened(text)}" for key, text in told.items()]
+
+    def refusal(self, reason: object) -> ValueError:
+        """Why the table is not read, with its first lines, what is known of it, and what reads it."""
+        likely = {each: [name for name in self.unused() if _stated_unit(name, each)] for each in self.missing}
+        columns = [f"{each}={names[0] if len(names) == 1 else 'NAME'}" for each, names in likely.items()]
+        told = "; ".join(" ".join(line.split()) for line in self.lines())
+        return ValueError(
+            f"{reason}. {told}. Say what is what: --columns {','.join(columns) or 'time=NAME'} (Python: columns), or fill in "
+            f"the file that battery-calibrate columns {self.source} writes"
+        )
 
 
 def find_columns(
     names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]], source: str = "FILE"
 ) -> Recognised:
     """Columns by quantity, from all names and the first rows; refused, with what helps, where one is missing."""
-    found = recognise(names, file_format, rows)
+    found = recognise(names, file_format, rows, source)
     if found.missing:
-        raise ValueError(_unknown(names, rows, found, source))
+        raise found.refusal(f"no column for the {', the '.join(found.missing)}")
     return found
 
 
-def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]]) -> Recognised:
+def recognise(
+    names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]], source: str = "FILE"
+) -> Recognised:
     """
     Which tester's table it is, the first of which it has all that a record needs, and its columns. A unit is told
     from the name, as in ``Current(mA)``, ``Voltage / V``, ``mAmps`` or ``test_time_second``, or from the line below it; one of
@@ -144,7 +172,7 @@ def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequ
         if tester is TESTERS[-1] or not tester.told_by or present & set(map(_key, tester.told_by)):
             found = _columns_of(tester, kept, labels, rows, file_format)
             missing = [each for each in REQUIRED if not {each, *INSTEAD.get(each, ())} & (set(found) | given)]
-            candidates.append(Recognised(tester, found, missing))
+            candidates.append(Recognised(tester, found, missing, names, rows, source))
             if not missing and "time" in found:
                 return candidates[-1]
     # the time in a step, or a date, where no tester's row has the time of the test
@@ -159,10 +187,11 @@ def _columns_of(
     for quantity in QUANTITIES:
         if quantity in INSTEAD["current"] and ("current" in found or file_format.load):
             continue
-        used = {column.position for column in found.values()}
-        places = _places(tester, quantity, names, labels, chosen.get(quantity))
-        if quantity not in chosen:  # a column is one thing, but where the caller says otherwise
-            places = {n: unit for n, unit in places.items() if n not in used and names[n] not in chosen.values()}
+        # a column is one thing, but where the caller says otherwise
+        used = {column.position for column in found.values()} | {n for n, name in enumerate(names) if name in chosen.values()}
+        left = labels if quantity in chosen else ["" if n in used else label for n, label in enumerate(labels)]
+        known = (*tester.columns.get(quantity, ()), *(BESIDE if quantity == "date" and "time" in found else ()))
+        places = _places(known, tester.units, quantity, names, left, chosen.get(quantity))
         if quantity == "state":
             places |= {n: "" for n in _of_words(row[: len(names)] for row in rows if len(row) >= len(names)) if names[n]}
         stated = (file_format.units or {}).get(quantity)
@@ -178,24 +207,28 @@ def _columns_of(
     return found
 
 
-def _places(tester: Tester, quantity: str, names: Sequence[str], labels: Sequence[str], chosen: str | None) -> dict[int, str]:
+def _places(
+    known: tuple[str, ...],
+    own_units: Mapping[str, str],
+    quantity: str,
+    names: Sequence[str],
+    labels: Sequence[str],
+    chosen: str | None,
+) -> dict[int, str]:
     """The columns that may be a quantity, those of the first name that there is, with the units that they tell."""
     if chosen is not None:
         place = next((n for n, name in enumerate(names) if name == chosen.strip()), None)
         if place is None:
             raise ValueError(f"there is no column {chosen!r} for the {quantity} among {', '.join(filter(None, names))}")
         return {place: _stated_unit(labels[place], quantity)}
-    ranks = _ranks(tuple(tester.columns.get(quantity, ())))
-    matches = {n: match for n, label in enumerate(labels) if (match := _match(label, quantity, ranks, tester.units))}
+    ranks = _ranks(known)
+    matches = {n: match for n, label in enumerate(labels) if (match := _match(label, quantity, ranks, own_units))}
     if not matches:
         return {}
     # a unit that is not known is taken where no other column of the quantity has one
-    best = min((bool(unit and quantity in _UNITS and not _unit(unit, quantity)), rank) for rank, unit in matches.values())
-    places = {
-        n: unit
-        for n, (rank, unit) in matches.items()
-        if (bool(unit and quantity in _UNITS and not _unit(unit, quantity)), rank) == best
-    }
+    is_unknown = {n: bool(unit and quantity in _UNITS and not _unit(unit, quantity)) for n, (_, unit) in matches.items()}
+    best = min((is_unknown[n], rank) for n, (rank, _) in matches.items())
+    places = {n: unit for n, (rank, unit) in matches.items() if (is_unknown[n], rank) == best}
     return places if quantity in REQUIRED else dict([next(iter(places.items()))])
 
 
@@ -324,39 +357,6 @@ def _of_words(rows: Iterable[Sequence[str]]) -> list[int]:
     """Columns of a few words."""
     texts = [{text for value in values if (text := value.strip())} for values in zip(*rows, strict=False)]
     return [n for n, words in enumerate(texts) if 0 < len(words) <= _FEW_WORDS and not any(map(_NUMBER.match, words))]
-
-
-def _unknown(names: Sequence[str], rows: Sequence[Sequence[str]], found: Recognised, source: str) -> str:
-    """What is said of a table that lacks what a record needs: its first lines, what is known, and what reads it."""
-    used = {column.position for column in found.columns.values()}
-    likely = {
-        quantity: [name for n, name in enumerate(names) if n not in used and _stated_unit(name, quantity)]
-        for quantity in found.missing
-    }
-    state = ",".join(f"{each}={likely[each][0] if len(likely[each]) == 1 else 'NAME'}" for each in found.missing)
-    known = ", ".join(f"{each} = {shown(column)}" for each, column in found.columns.items()) or "nothing"
-    lines = "; ".join(shortened(", ".join(row)) for row in rows[:2])
-    return (
-        f"no column for the {', the '.join(found.missing)} among {shortened(', '.join(map(str, names)))}. The first rows: "
-        f"{lines}. Recognised: {known}. Say which it is: --columns {state} (Python: columns), or fill in the file that "
-        f"battery-calibrate columns {source} writes"
-    )
-
-
-def description(names: Sequence[str], rows: Sequence[Sequence[str]], found: Recognised) -> str:
-    """What is recognised of a table, with its first lines."""
-    used = {column.position for column in found.columns.values()}
-    others = ", ".join(name for n, name in enumerate(names) if name and n not in used)
-    return "\n".join(
-        [
-            f"header      {shortened(', '.join(names))}",
-            *(f"row {n}       {shortened(', '.join(row))}" for n, row in enumerate(rows[:2], start=1)),
-            f"tester      {found.tester.name}",
-            *(f"{key:<12}{shown(column)}" for key, column in found.columns.items()),
-            *(f"{quantity:<12}not found" for quantity in found.missing),
-            f"not used    {shortened(others)}",
-        ]
-    )
 
 
 def shown(column: Column) -> str:

@@ -19,7 +19,7 @@ from battery_env.checks import LOAD_LIMITS
 from battery_env.lab.readers.columns import FileFormat, Recognised, find_columns, say
 from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, SOME_SHARE, cells_of, rows_of_cell
 from battery_env.lab.readers.signs import MUCH_SHARE, with_signed_current
-from battery_env.lab.readers.tables import check_mat, open_frame, read_columns
+from battery_env.lab.readers.tables import check_mat, open_file, open_frame
 from battery_env.lab.readers.testers import Tester, find_tester
 from battery_env.records import (
     LEAST_LOAD_SHARE,
@@ -113,8 +113,7 @@ def read_discharges(
     :raises ValueError: if there is none, the file is damaged, or it does not tell what is asked for
     :raises ImportError: if the file needs an extra that is not installed
     """
-    known = None if tester is None else find_tester(tester)
-    file_format = FileFormat(columns, units, discharge_is_negative, ignore, known)
+    file_format = FileFormat(columns, units, discharge_is_negative, ignore, find_tester(tester))
     return each_usable(lambda each: each, {_name_of(source): lambda: read_recordings(source, file_format)})
 
 
@@ -165,15 +164,13 @@ def read_recordings(source: str | Path | pd.DataFrame, file_format: FileFormat) 
     """
     name = _name_of(source)
     try:
-        if isinstance(source, pd.DataFrame):
-            opened = open_frame(source)
-            known = find_columns(opened.names, file_format, opened.rows, name)
-            recordings = _recordings(name, opened.read(known), known, file_format)
-        elif Path(source).suffix.lower() == ".mat":
+        if not isinstance(source, pd.DataFrame) and Path(source).suffix.lower() == ".mat":
             check_mat(Path(source))
             recordings = [Recording(arrays, meta) for arrays, meta in read_nasa_mat(Path(source))]
         else:
-            recordings = _recordings(name, *read_columns(Path(source), file_format), file_format)
+            opened = open_frame(source) if isinstance(source, pd.DataFrame) else open_file(Path(source), file_format)
+            known = find_columns(opened.names, file_format, opened.rows, name)
+            recordings = _recordings(name, opened.read(known), known, file_format)
         if not recordings:
             raise ValueError("there is no discharge")
     except (TypeError, ValueError) as error:
@@ -194,7 +191,7 @@ def _recordings(source: str, table: pd.DataFrame, known: Recognised, file_format
     for cell, rows in cells_of(table).items():
         meta = {"source": source} | ({"cell": cell} if cell else {})
         try:
-            rows = rows_of_cell(rows, known.columns, file_format)
+            rows = rows_of_cell(rows, known, file_format)
             if not file_format.load:  # which is what it says
                 rows = with_signed_current(rows, known, file_format.discharge_is_negative)
             found += _split(rows, meta, stated)

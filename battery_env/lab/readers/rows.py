@@ -18,7 +18,7 @@ import pandas as pd
 
 from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import ZERO_CELSIUS_K
-from battery_env.lab.readers.columns import Column, FileFormat, direction, say
+from battery_env.lab.readers.columns import Column, FileFormat, Recognised, direction, say
 from battery_env.lab.readers.testers import REQUIRED
 from battery_env.records import LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE
 from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES
@@ -60,9 +60,9 @@ def cells_of(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {str(name): rows for name, rows in table.groupby(cells, sort=False)}
 
 
-def rows_of_cell(table: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> pd.DataFrame:
+def rows_of_cell(table: pd.DataFrame, known: Recognised, file_format: FileFormat) -> pd.DataFrame:
     """The rows of a cell in SI units, and in order; the current has the sign of the file."""
-    rows = with_current(on_its_clock(in_si_units(table, columns), columns), columns, file_format)
+    rows = with_current(on_its_clock(in_si_units(table, known), known.columns), known.columns, file_format)
     for mend in (without_incomplete, without_dead_ends, with_newest_last, with_one_row_at_a_time):
         rows = mend(rows)
     return rows
@@ -74,21 +74,24 @@ def place_of(rows: pd.DataFrame, which: BoolArray) -> str:
     return f"{places[0] + 1}" + (f" and {len(places) - 1} more" if len(places) > 1 else "")
 
 
-def in_si_units(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
+def in_si_units(table: pd.DataFrame, known: Recognised) -> pd.DataFrame:
     """Numbers in SI units, a column a quantity, NaN where there is none; what is not needed and cannot be read is left out."""
     found: dict[str, Any] = {}
-    for quantity, read in _READ.items():
-        if quantity in table:
+    columns = known.columns
+    for key, column in columns.items():
+        quantity = key.partition(" ")[0]
+        if quantity in _READ and (key == quantity or quantity in found):
             try:
-                found[quantity] = read(table[quantity], columns[quantity])
+                values = _read(quantity, table[key], column)
             except ValueError as error:
                 if quantity in REQUIRED or REQUIRED[0] not in table:
-                    raise
+                    raise known.refusal(error) from error
                 say(f"{error}. It is left out")
-    for key in columns:
-        quantity = key.partition(" ")[0]
-        if key != quantity and quantity in found:
-            _check_agree(found[quantity], _READ[quantity](table[key], columns[key]), columns[quantity], columns[key], quantity)
+                continue
+            if key == quantity:
+                found[quantity] = values
+            else:
+                _check_agree(found[quantity], values, columns[quantity], column, quantity)
         elif quantity == "state":
             codes, names = pd.factorize(table[key])
             directions = np.array([*map(direction, names), 0])[codes]
@@ -97,6 +100,14 @@ def in_si_units(table: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFr
     if "step" in table:
         found["step"] = pd.factorize(table["step"])[0]
     return pd.DataFrame(found, index=table.index)
+
+
+def _read(quantity: str, values: pd.Series, column: Column) -> FloatArray:
+    try:
+        return _READ[quantity](values, column)
+    except Exception as error:  # pandas raises whatever a value leads it to
+        what = "" if column.name in str(error) else f"the column {column.name!r} cannot be read: "
+        raise ValueError(f"{what}{error}") from error
 
 
 def _check_agree(one: FloatArray, other: FloatArray, first: Column, second: Column, quantity: str) -> None:
@@ -301,15 +312,17 @@ def _added_up(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _tick_of_clock(rows: pd.DataFrame, columns: Mapping[str, Column]) -> float:
-    """What a clock counts in whose name has no unit, s, where dates beside it tell; these count whole seconds."""
+    """What a clock counts in whose name has no unit, s, where another clock tells, which may have none either."""
     if columns["time"].unit or "date" not in rows:
         return 1.0
-    ticks, span_s = float(np.ptp(rows["time"].ffill().bfill())), float(np.ptp(rows["date"].ffill().bfill()))
+    ticks, beside = (float(np.ptp(rows[each].ffill().bfill())) for each in ("time", "date"))
+    is_number = not columns["date"].unit and rows["date"].max() < 1e8
     for unit, (_, tick_s) in CLOCKS.items():
-        if abs(span_s - tick_s * ticks) <= 1.0 + NOTHING_SHARE * span_s:
-            if tick_s != 1.0:
-                say(f"{columns['time'].name!r} counts {unit}, as {columns['date'].name!r} tells")
-            return tick_s
+        for span_s in [beside * each_s for _, each_s in CLOCKS.values()] if is_number else [beside]:
+            if abs(span_s - tick_s * ticks) <= min(1.0, SOME_SHARE * span_s) + NOTHING_SHARE * span_s:
+                if tick_s != 1.0:
+                    say(f"{columns['time'].name!r} counts {unit}, as {columns['date'].name!r} tells")
+                return tick_s
     return 1.0
 
 

@@ -14,7 +14,7 @@ import zipfile
 import zlib
 from codecs import getincrementaldecoder
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 from battery_env.files import LARGEST_UNPACKED_BYTES
-from battery_env.lab.readers.columns import FileFormat, Recognised, are_units, count_required, find_columns, has, say
+from battery_env.lab.readers.columns import FileFormat, Recognised, are_units, count_required, has, say
 from battery_env.lab.readers.testers import ENCODINGS, REQUIRED
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
@@ -49,6 +49,8 @@ _NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
 _DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
 # Some testers put lines as a whole in quotes.
 _QUOTED_LINES = re.compile(rb'^"([^"\n]*)"\s*$', flags=re.MULTILINE)
+# What pandas says of quotes that are open at the end of a file.
+_OPEN_QUOTES = re.compile(r"EOF inside string starting at row (\d+)")
 # How workbooks begin; text is called .xls by some testers.
 _WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 _EXPORT = {".res": "export the channel as CSV in MITS Pro", ".h5": "export the records as CSV"}
@@ -76,13 +78,6 @@ class Opened(NamedTuple):
     names: list[str]
     rows: list[list[str]]
     read: Callable[[Recognised], pd.DataFrame]  # the columns of a record, by quantity, and no others
-
-
-def read_columns(path: Path, file_format: FileFormat) -> tuple[pd.DataFrame, Recognised]:
-    """Read the columns of a record, and no others."""
-    opened = open_file(path, file_format)
-    found = find_columns(opened.names, file_format, opened.rows, str(path))
-    return opened.read(found), found
 
 
 def open_file(path: Path, file_format: FileFormat) -> Opened:
@@ -154,7 +149,12 @@ def _check_unpacked(count: int) -> None:
 
 def _read_text(content: bytes, layout: Layout, found: Recognised) -> pd.DataFrame:
     _check_width(layout)
-    header_lines = layout.header_line + 1 + (bool(layout.rows) and are_units(layout.rows[0]))
+    has_units = bool(layout.rows) and are_units(layout.rows[0])
+    width = max(map(len, layout.rows[has_units:]), default=0)
+    if not width:
+        raise ValueError("there are no rows below the header")
+    # one column may serve as two quantities
+    positions = sorted({*range(layout.layers), *(each.position for each in found.columns.values())})
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of columns that are text in parts, which is seen later
@@ -163,25 +163,25 @@ def _read_text(content: bytes, layout: Layout, found: Recognised) -> pd.DataFram
                 sep=layout.delimiter,
                 decimal=layout.decimal,
                 encoding=layout.encoding,
+                encoding_errors="replace",  # of remarks; what is no number is seen later
                 header=None,
-                names=range(len(layout.names)) if layout.layers else None,
-                skiprows=header_lines,
-                # one column may serve as two quantities
-                usecols=sorted({*range(layout.layers), *(each.position for each in found.columns.values())}),
+                names=range(width),
+                skiprows=layout.header_line + 1 + has_units,
+                usecols=[n for n in positions if n < width],
                 index_col=False,
                 na_values=[*found.tester.missing],
             )
-    except pd.errors.EmptyDataError as error:
-        raise ValueError("there are no rows below the header") from error
     except Exception as error:  # pandas raises whatever the damage leads it to
         kept, _, last = content.rstrip().rpartition(b"\n")
-        if "EOF inside string" not in str(error) or last.count(b'"') % 2 == 0:
-            raise ValueError(f"the file is damaged, or no table: {str(error).strip()}") from error
+        if not (quotes := _OPEN_QUOTES.search(str(error))):
+            raise found.refusal(f"the file is damaged, or no table: {str(error).strip()}") from error
+        if last.count(b'"') % 2 == 0:
+            raise found.refusal(f"the quotes that begin in row {int(quotes[1]) + 1} do not end") from error
         say("the last line is cut within quotes, and left out")
         return _read_text(kept, layout, found)
     if layout.decimal == ",":  # words among numbers make text of all
         table = table.replace(_ITS_COMMA, r"\1.", regex=True)
-    table = _lowest_layer(table, layout.layers)
+    table = _lowest_layer(table.reindex(columns=positions), layout.layers)
     return pd.DataFrame({key: table[column.position] for key, column in found.columns.items()})
 
 
@@ -275,22 +275,24 @@ def _layout_of(head: bytes, file_format: FileFormat) -> Layout:
 
 
 def _layout(text: str, encoding: str, file_format: FileFormat) -> Layout:
-    lines = io.StringIO(text, newline=None).read().split("\n")
+    lines = io.StringIO(text, newline=None).read().split("\n")[: _HEAD_LINES + _FIRST_ROWS]
     delimiters: tuple[str, ...] = _DELIMITERS
     if stated := _DELIMITER_LINE.match(lines[0]):
         lines[0], delimiters = "", (stated[1],)
-    number, delimiter = _header(lines, delimiters, file_format)
-    rows = [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
-    names = _fields(lines[number], delimiter, len(next(filter(None, rows), lines)))
+    filled = [number for number, line in enumerate(lines) if line.strip()]
+    below = {number: lines[after] for number, after in itertools.pairwise(filled)}
+    tables = {each: [_fields(line, below.get(number, ""), each) for number, line in enumerate(lines)] for each in delimiters}
+    delimiter, number = _find_header(tables, file_format)
+    table = tables[delimiter]
+    above, names, rows = table[:number], [*table[number]], table[number + 1 :][:_FIRST_ROWS]
     if len(names) > _MOST_COLUMNS:
         raise ValueError(f"{len(names)} columns are more than the {_MOST_COLUMNS} that are read")
-    layers = next((n for n, name in enumerate(names) if name), 0) if delimiter != _BLANKS else 0
-    below = [any(row[:layers]) for row in rows if any(row)]
-    if 2 * sum(below) >= len(below):
+    layers = next((n for n, name in enumerate(names) if name), 0)
+    is_above = [any(row[:layers]) for row in rows if any(row)]
+    if 2 * sum(is_above) >= len(is_above):
         layers = 0
     for n in range(layers):
-        above = [fields[n] for fields in (_fields(line, delimiter) for line in lines[:number]) if any(fields[n : n + 1])]
-        names[n] = above[-1] if above else ""
+        names[n] = next((row[n] for row in reversed(above) if any(row[n : n + 1])), "")
     values = [field for row in rows for field in row]
     commas, points = (sum(map(bool, map(mark.match, values))) for mark in (_DECIMAL_COMMA, _DECIMAL_POINT))
     return Layout(encoding, number, delimiter, "," if commas > points and delimiter != _BLANKS else ".", names, layers, rows)
@@ -307,70 +309,55 @@ def _check_width(layout: Layout) -> None:
         )
 
 
-def _header(lines: Sequence[str], delimiters: Sequence[str], file_format: FileFormat) -> tuple[int, str]:
-    """The line with the names of the columns, and the delimiter."""
-    filled = [number for number, line in enumerate(lines) if line.strip()][:_HEAD_LINES]
-    if not filled:
+class _Header(NamedTuple):
+    """A row that may hold the names of the columns, and what speaks for it, the most telling first."""
+
+    quantities: int  # of a record, so many
+    fits: int  # so many of the rows below hold numbers in as many fields
+    nearness: int  # to them
+    table: str
+
+
+def _find_header(tables: Mapping[str, Sequence[Sequence[str]]], file_format: FileFormat) -> tuple[str, int]:
+    """In which of some tables, by delimiter or by sheet, and in which of its rows the names of the columns are."""
+    candidates: dict[tuple[str, ...], _Header] = {}  # by names, which may come again
+    numbers: Sequence[str] = ()
+    for key, rows in tables.items():
+        counts = [_count_numbers(row) for row in rows]
+        is_row = np.array(counts) > 1
+        numbers = numbers or next((rows[n] for n in np.flatnonzero(is_row)), ())
+        # a delimiter may end each
+        widths = np.array([(len(row), len([*filter(None, row)])) for row in rows]).reshape(-1, 2)
+        for n in [n for n, row in enumerate(rows[:_HEAD_LINES]) if any(row) and not counts[n]]:
+            below = slice(n + 1, n + 1 + _FIRST_ROWS)
+            fits = int((is_row[below] & (widths[below] == widths[n]).any(axis=1)).sum())
+            found = _Header(count_required(rows[n], file_format), fits, n if fits else -n, key)
+            candidates.setdefault(tuple(filter(None, rows[n])), found)
+    best = max(candidates.values(), key=lambda each: each[:3], default=_Header(0, 0, 0, ""))
+    if numbers and not (best.quantities or best.fits):
+        raise ValueError(
+            "there is no line with the names of the columns above the numbers. Add one. The first line of numbers: "
+            f"{', '.join(numbers)[:99]}"
+        )
+    if not candidates:
         raise ValueError("the file is empty")
-    best: dict[tuple[str, ...], tuple[int, str]] = {}
-    found = 1
-    for number, below in itertools.pairwise([*filled, filled[-1]]):
-        for delimiter in delimiters:
-            most = len(_fields(lines[below], delimiter)) if delimiter == _BLANKS else np.inf
-            names = _fields(lines[number], delimiter, most)
-            has_numbers = _count_numbers(names) > 0
-            # blanks within names, or in a sentence
-            if (delimiter == _BLANKS and len(names) > most) or (
-                has_numbers and (delimiter == _BLANKS or found == len(REQUIRED))
-            ):
-                continue
-            count = count_required(names, file_format)
-            if count > found:
-                best, found = {}, count
-            if count == found and (not best or not has_numbers):
-                best.setdefault(tuple(filter(None, names)), (number, delimiter))
-            if found == len(REQUIRED):
-                delimiters = (delimiter,)
-                break
-    if best:
-        first, *others = itertools.islice(best.values(), 9)
-        header = max([first, *others], key=lambda each: _fit(lines, *each)) if others else first
-        if header != first:
-            say(f"the header is line {header[0] + 1}; the table of line {first[0] + 1} is left out")
-        return header
-    # names come apart as often as the first numbers below them
-    for above, number in itertools.pairwise([-1, *filled]):
-        apart = [each for each in delimiters if _count_numbers(_fields(lines[number], each)) > 1]
-        alike = [
-            each for each in apart if above >= 0 and len(_fields(lines[above], each)) == len(_fields(lines[number], each))
-        ]
-        if alike:
-            return above, alike[0]
-        if apart:
-            raise ValueError(
-                "there is no line with the names of the columns above the numbers. Add one. The first line of numbers: "
-                f"{lines[number][:99]}"
-            )
-    return filled[0], delimiters[0]
-
-
-def _fit(lines: Sequence[str], number: int, delimiter: str) -> int:
-    """How well the lines below a header hold numbers in as many fields as it has names; a delimiter may end each."""
-    rows = [_fields(line, delimiter) for line in lines[number + 1 :][:_FIRST_ROWS]]
-    width = len(_fields(lines[number], delimiter, max(map(len, rows), default=0)))
-    filled = [len([*filter(None, row)]) if _count_numbers(row) > 1 else -1 for row in rows]
-    return sum(2 * (count >= 0 and len(row) == width) or count == width for row, count in zip(rows, filled, strict=True))
+    first = next(each for each in candidates.values() if each.quantities == best.quantities)
+    if best.quantities and first != best:
+        say(f"the header is line {abs(best.nearness) + 1}; the table of line {abs(first.nearness) + 1} is left out")
+    return best.table, abs(best.nearness)
 
 
 def _count_numbers(fields: Sequence[str]) -> int:
     return sum(bool(_NUMBER.match(field) or _DECIMAL_COMMA.match(field)) for field in fields)
 
 
-def _fields(line: str, delimiter: str, most: float = np.inf) -> list[str]:
+def _fields(line: str, next_line: str, delimiter: str) -> list[str]:
     # numpy writes a header as a comment
     line = line.lstrip("# ")
-    if delimiter == _BLANKS:  # of which two or more part names of several words
-        return fields if len(fields := line.replace('"', " ").split()) <= most else re.split(r"\s{2,}", line.strip())
+    if delimiter == _BLANKS:
+        fields, below = (each.replace('"', " ").split() for each in (line, next_line))
+        # of which two or more part names of several words
+        return fields if len(fields) <= len(below) else re.split(r"\s{2,}", line.strip())
     try:
         return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
     except csv.Error:
@@ -392,15 +379,6 @@ def _reading(kind: str, extra: str) -> Iterator[None]:
         raise ValueError(f"what reads {kind} files does not know all of this one: {error}") from error
     except Exception as error:  # whatever the damage leads to
         raise ValueError(f"the file is damaged, or no {kind} file: {str(error).strip()}") from error
-
-
-class Sheet(NamedTuple):
-    """A sheet of a workbook that may hold the record."""
-
-    title: str
-    header: list[str]  # of its columns; what is above is left out
-    known: int  # quantities of a record in the header
-    rows: list[list[str]]  # below the header
 
 
 def _sheets(path: Path) -> Iterator[tuple[str, Iterable[Sequence[Any]]]]:
@@ -429,25 +407,26 @@ def _cell_of_xls(cell: Any, datemode: int) -> Any:
 def _sheet(path: Path, file_format: FileFormat) -> bytes:
     """The sheet of a workbook that holds the record, and those that continue it, as text."""
     with _reading("Excel", "excel"):
-        found = [_read_sheet(title, rows, file_format) for title, rows in _sheets(path)]
-    best = max(found, key=lambda sheet: (sheet.known, len(sheet.rows)))
-    parts = [sheet for sheet in found if sheet.header == best.header]
+        sheets = {title: _rows_of_sheet(title, rows) for title, rows in _sheets(path)}
+    title, line = _find_header({each: rows[: _HEAD_LINES + _FIRST_ROWS] for each, rows in sheets.items()}, file_format)
+    header = sheets[title][line]
+    parts = [rows[rows.index(header) + 1 :] for rows in sheets.values() if header in rows[:_HEAD_LINES]]
     # each may be a test of its own
-    numbered = len(parts) > 1 and not has("cycle", best.header)
+    numbered = len(parts) > 1 and not has("cycle", header)
     text = io.StringIO()
-    writer, width = csv.writer(text, lineterminator="\n"), len(best.header)
-    writer.writerow([*best.header, *["Cycle"] * numbered])
-    for number, sheet in enumerate(parts, start=1):
-        writer.writerows([*row[:width], *[""] * (width - len(row)), *[number] * numbered] for row in sheet.rows)
+    writer, width = csv.writer(text, lineterminator="\n"), len(header)
+    writer.writerows([*sheets[title][:line], [*header, *["Cycle"] * numbered]])
+    for number, rows in enumerate(parts, start=1):
+        writer.writerows([*row[:width], *[""] * (width - len(row)), *[number] * numbered] for row in rows)
     return text.getvalue().encode()
 
 
-def _read_sheet(title: str, rows: Iterable[Sequence[Any]], file_format: FileFormat) -> Sheet:
-    """A sheet from its header on; refused where it is too large."""
+def _rows_of_sheet(title: str, rows: Iterable[Sequence[Any]]) -> list[list[str]]:
+    """The rows of a sheet that are filled; refused where it is too large."""
     kept: list[list[str]] = []
     size = 0
     for row in rows:
-        fields = ["" if value is None else str(value) for value in row]
+        fields = ["" if value is None else " ".join(str(value).split()) for value in row]
         while fields and not fields[-1]:
             fields.pop()
         if len(fields) > _MOST_COLUMNS:
@@ -456,9 +435,7 @@ def _read_sheet(title: str, rows: Iterable[Sequence[Any]], file_format: FileForm
             kept.append(fields)
             size += sum(map(len, fields)) + 60 * len(fields)  # as Python keeps text
             _check_unpacked(size)
-    known = [count_required(fields, file_format) for fields in kept[:_FIRST_ROWS]] or [0]
-    line = int(np.argmax(known))
-    return Sheet(title, kept[line] if kept else [], max(known), kept[line + 1 :])
+    return kept
 
 
 def _open_parquet(path: Path) -> Opened:
@@ -475,7 +452,9 @@ def _open_parquet(path: Path) -> Opened:
                 sizes[chunk.path_in_schema.split(".")[0]] += chunk.total_uncompressed_size
     is_text = {each.name: types.is_string(each.type) or types.is_large_string(each.type) for each in fields}
     is_plain = {each.name: not types.is_nested(each.type) and not types.is_binary(each.type) for each in fields}
-    usable = [each.name for each in fields if is_plain[each.name] and sizes[each.name] <= LARGEST_UNPACKED_BYTES // 8]
+    counts = Counter(each.name for each in fields)  # of a name that comes twice nothing tells which is meant
+    usable = [each.name for each in fields if is_plain[each.name] and counts[each.name] == 1]
+    usable = [name for name in usable if sizes[name] <= LARGEST_UNPACKED_BYTES // 8]
 
     def read(names: Sequence[str], most_rows: int | None = None) -> pd.DataFrame:
         text = [name for name in names if is_text[name]]
@@ -487,8 +466,9 @@ def _open_parquet(path: Path) -> Opened:
             return pd.DataFrame(columns=[*names]) if first is None else first.to_pandas(ignore_metadata=True)
 
     def read_columns_of(found: Recognised) -> pd.DataFrame:
-        table = read(sorted({column.name for column in found.columns.values()}))
-        return pd.DataFrame({key: table[column.name] for key, column in found.columns.items()})
+        name_of = {key: fields[column.position].name for key, column in found.columns.items()}
+        table = read(sorted({*name_of.values()}))
+        return pd.DataFrame({key: table[name] for key, name in name_of.items()})
 
     names = [each.name if each.name in usable else "" for each in fields]
     head = read(usable, _FIRST_ROWS).reindex(columns=[each.name for each in fields])

@@ -16,7 +16,7 @@ else:
 
 #: What a column may hold, and what a record must have.
 QUANTITIES = tuple(
-    "time date step_time voltage counter current power charge_step temperature ambient capacity cycle step cell state".split()
+    "time step_time date voltage counter current power charge_step temperature ambient capacity cycle step cell state".split()
 )
 REQUIRED = ("time", "voltage", "current")
 
@@ -157,13 +157,15 @@ def joined(first: Tester, others: Sequence[Tester], clocks: bool = True) -> Test
 _ANY = joined(_PLAIN, _KNOWN)
 #: The rows, in the order in which they are tried; the last one knows the names of all.
 TESTERS = (*(joined(each, [_ANY], clocks=False) for each in _KNOWN), _ANY)
+#: Names of a second clock, which may tell what the first one counts in.
+BESIDE = (*_ANY.columns["date"], *_ANY.columns["time"])
 #: How text is encoded that is not UTF-8.
 ENCODINGS = tuple(dict.fromkeys(each.encoding for each in (_PLAIN, *_KNOWN) if each.encoding))
 
 
-def find_tester(name: str | Path | Tester) -> Tester:
-    """A tester by its name, or from a file in TOML as :func:`tester_file` writes it."""
-    if isinstance(name, Tester):
+def find_tester(name: str | Path | Tester | None) -> Tester | None:
+    """A tester by its name, or from a file in TOML as :func:`tester_file` writes it; ``None``: it is told from the table."""
+    if name is None or isinstance(name, Tester):
         return name
     for tester in TESTERS:
         if tester.name.lower() == str(name).strip().lower():
