@@ -285,7 +285,7 @@ def test_a_file_that_has_changed_is_read_again(pair, capsys):
     arguments = "calibrate lab --out out --table-only".split()
     assert main(arguments) == 0
     before = pd.read_csv("out/estimate.csv")
-    write(load_nasa_discharges("B0006")[120], Path("lab/c1.csv"))
+    write(load_nasa_discharges("B0006")[72], Path("lab/c1.csv"))
     assert main(arguments) == 0
     assert "going on: 1 discharges are done" in capsys.readouterr().err
     again = pd.read_csv("out/estimate.csv")
