@@ -307,9 +307,9 @@ def _note_rest(rest: Row, time_s: float, interval_s: float, current: float) -> N
 
 @compiled
 def _rest_current_C(evidence: Row) -> float:
-    # what the current before the load makes of the charge, if that was none of the loads
+    # what the current before the load makes of the charge, if no load; one without samples was told by the whole recording
     rest = evidence.rest
-    is_rest = rest.is_over and abs(rest.mean_A) <= LOAD_SHARE * evidence.switches.largest_A
+    is_rest = rest.is_over and (rest.samples == 0 or abs(rest.mean_A) <= LOAD_SHARE * evidence.switches.largest_A)
     return abs(rest.mean_A) * (evidence.time_s - rest.over_s) if is_rest else 0.0
 
 
