@@ -147,7 +147,7 @@ def report(study: Study) -> None:
     for _, of_env in runs.groupby("env"):
         for_readers, table = contest_of(of_env["made_by"].iloc[0]["recipe"]["env_id"]).report(of_env, study)
         tables.append(table)
-        shown.setdefault(tuple(for_readers), []).append(for_readers)
+        shown.setdefault(tuple(for_readers.columns), []).append(for_readers)
     together = pd.concat(tables, ignore_index=True)
     if len(together) > 0:
         study.write_table("compare", together, recipes_of(runs))

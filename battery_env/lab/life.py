@@ -173,11 +173,11 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     :param calibrator: without a prior; ``None``: least squares with the constants of a new 18650 as they are
     :raises ValueError: if no discharge is valid, or the calibrator has a prior or no full cell at the start
     """
-    if calibrator is None:
-        calibrator = Settings(method="least-squares", cell_rates_sd={}).calibrator()
-    if calibrator.prior_q_mobile_C is not None:
+    chosen = calibrator or Settings(method="least-squares", cell_rates_sd={}).calibrator()
+    assert isinstance(chosen, LeastSquares)
+    if chosen.prior_q_mobile_C is not None:
         raise ValueError("the calibrator must have no prior of q_mobile: each discharge has to speak for itself")
-    if calibrator.initial_soc != (1.0, 0.0):
+    if chosen.initial_soc != (1.0, 0.0):
         raise ValueError("the calibrator must take discharges to start full: the charge to the cut-off is no capacity else")
     if not len(discharges):
         raise ValueError("discharges must hold at least one discharge")
@@ -185,7 +185,7 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     for position, discharge in enumerate(discharges):
         row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
         try:
-            rows.append(row | _row_of(discharge, cut_off_V, calibrator))
+            rows.append(row | _row_of(discharge, cut_off_V, chosen))
         except ValueError as error:  # of one that cannot be used
             rows.append(row | {"settled": False, "valid": False, "reason": str(error)})
     return life_of(pd.DataFrame(rows, columns=_COLUMNS))

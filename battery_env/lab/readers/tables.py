@@ -325,7 +325,7 @@ def _find_header(tables: Mapping[str, Sequence[Sequence[str]]], file_format: Fil
     for key, rows in tables.items():
         counts = [_count_numbers(row) for row in rows]
         is_row = np.array(counts) > 1
-        numbers = numbers or next((rows[n] for n in np.flatnonzero(is_row)), ())
+        numbers = numbers or next((rows[n] for n in np.flatnonzero(is_row).tolist()), ())
         # a delimiter may end each
         widths = np.array([(len(row), len([*filter(None, row)])) for row in rows]).reshape(-1, 2)
         for n in [n for n, row in enumerate(rows[:_HEAD_LINES]) if any(row) and not counts[n]]:
