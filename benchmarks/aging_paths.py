@@ -210,8 +210,8 @@ def _row(
     row |= {"q_error_percent": 100.0 * (found.q_mobile / whole.q_mobile - 1.0)}
     if share == 1.0:
         return row
-    known: dict[str, Any] = {"model": RecordModel(path.cell), "mismatch_V": mismatch_V or path.mismatch_V}
-    ahead = forecast(record, found, cut_off_V=CUT_OFF_V, **known)
+    model, expected_V = RecordModel(path.cell), mismatch_V or path.mismatch_V
+    ahead = forecast(record, found, cut_off_V=CUT_OFF_V, model=model, mismatch_V=expected_V)
     return row | _end(whole, ahead.eod_quantile_s(BAND))
 
 

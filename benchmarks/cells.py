@@ -219,7 +219,7 @@ def plot_life(whole: pd.DataFrame) -> Figure:
         upper.legend(frameon=False, loc="upper right", fontsize=9)
         lower.legend(frameon=False, loc="upper left", fontsize=9)
     # room for the legend
-    panels[1, 0].set(ylim=(None, 1.2e3 * (whole["r_o_ohm"] + whole["sd_r_o_ohm"]).max()), ylabel=r"resistance (m$\Omega$)")
+    panels[1, 0].set(ylim=(None, 1.3e3 * (whole["Re_ohm"] + whole["Rct_ohm"]).max()), ylabel=r"resistance (m$\Omega$)")
     panels[0, 0].set_ylabel("charge (Ah)")
     figure.align_ylabels(panels[:, 0])
     return figure
