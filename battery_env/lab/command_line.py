@@ -217,7 +217,7 @@ examples:
 def _parser(name: str) -> argparse.ArgumentParser:
     parser = _reading(
         name,
-        usage=f"{name} FILE [FILE ...] [options]",
+        usage=f"{name} FILE [FILE ...] [options]\n       {name} B0005:100, for example; --help has more",
         description=_FIRST.format("\n".join(f"  {_INSTALLED} {other:<10}{what}" for other, (_, what) in _OTHERS.items())),
         epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
