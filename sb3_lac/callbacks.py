@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 class LyapunovCallback(EventCallback):
     """
     Callback for evaluating the learned Lyapunov function along roll-outs of the mean action (see ``evaluate_lyapunov()``).
-    The training is not changed by it. TensorBoard also gets the limits of the confidence intervals (``lyapunov/<name>_low``,
-    ``lyapunov/<name>_high``) and the figure of each report (``lyapunov/report``).
+    The training is not changed by it. TensorBoard also gets the figure of each report (``lyapunov/report``).
 
     .. warning::
 
@@ -141,14 +140,11 @@ class LyapunovCallback(EventCallback):
         return self._on_event()
 
     def _log(self, values: dict[str, float]) -> None:
-        """Log values everywhere; the limits of their intervals, and figures, in TensorBoard only."""
-        in_tensorboard = tensorboard_writer(self.logger) is not None
+        """Log values, whose intervals are in the history, and in TensorBoard their figures."""
         for name, value in values.items():
             if not name.endswith(("_low", "_high")):
                 self.logger.record(f"{self.FOLDER}/{name}", value)
-            elif in_tensorboard:
-                self.logger.record(f"{self.FOLDER}/{name}", value, exclude=NOT_TENSORBOARD)
-        if in_tensorboard:
+        if tensorboard_writer(self.logger) is not None:
             for name, figure in self._figures().items():
                 self.logger.record(f"{self.FOLDER}/{name}", Figure(figure, close=False), exclude=NOT_TENSORBOARD)
         # Dump log so the evaluation results are printed with the correct timestep
@@ -182,8 +178,7 @@ class CertificateCallback(LyapunovCallback):
     action (see ``fit_lyapunov()``), exact statements are made about others (see ``certify()``), and the function is judged on
     yet others (see ``evaluate_lyapunov()``). The training is not changed by it. Each of the three takes its own seed, so that
     all evaluations have the same start states and none is judged on what it was fitted on. Where nothing has a cost there is
-    nothing to certify: all values are then NaN. TensorBoard also gets the limits of the confidence intervals
-    (``certificate/<name>_low``, ``certificate/<name>_high``) and two figures, ``certificate/drift`` and
+    nothing to certify: all values are then NaN. TensorBoard also gets two figures, ``certificate/drift`` and
     ``certificate/statements``.
 
     :param eval_env: The environment used for evaluation, as for ``LyapunovCallback``

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import sys
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule
 from torch.utils.tensorboard import SummaryWriter
@@ -25,30 +26,18 @@ NOT_TENSORBOARD = ("stdout", "log", "json", "csv")
 
 #: The charts of every run. A run that does not log a tag is left out of its chart.
 CHARTS: Charts = {
-    "Returns and costs": {
+    "Comparison": {
+        "cost of an evaluation episode, log10": ["Multiline", ["eval/cost_log10$"]],
         "return of an evaluation": ["Multiline", ["eval/mean_reward$"]],
+        "length of an evaluation episode": ["Multiline", ["eval/mean_ep_length$"]],
         "return of the training episodes": ["Multiline", ["rollout/ep_rew_mean$"]],
         "cost per step of the training": ["Multiline", ["rollout/cost_mean$"]],
-        "length of an evaluation episode": ["Multiline", ["eval/mean_ep_length$"]],
     },
     "Lyapunov": {
         "lambda": ["Multiline", ["train/lambda$"]],
-        "decrease along roll-outs": ["Margin", ["lyapunov/decrease", "lyapunov/decrease_low", "lyapunov/decrease_high"]],
+        "decrease along roll-outs": ["Multiline", ["lyapunov/decrease$"]],
         "decrease in the replay buffer": ["Multiline", ["train/lyapunov_difference$"]],
-        "largest feasible alpha3": [
-            "Margin",
-            ["lyapunov/feasible_alpha3", "lyapunov/feasible_alpha3_low", "lyapunov/feasible_alpha3_high"],
-        ],
-    },
-    "Certificates of any algorithm": {
-        "mean cost settles below": ["Multiline", ["certificate/cost_bound$"]],
-        "largest feasible alpha3, fitted function": ["Multiline", ["certificate/feasible_alpha3$"]],
-        "share that survives, at least": ["Multiline", ["certificate/survives_at_least$"]],
-    },
-    "Updates": {
-        "critic loss": ["Multiline", ["train/critic_loss$"]],
-        "actor loss": ["Multiline", ["train/actor_loss$"]],
-        "entropy coefficient": ["Multiline", ["train/ent_coef$"]],
+        "largest feasible alpha3": ["Multiline", ["lyapunov/feasible_alpha3$"]],
     },
 }
 
@@ -91,6 +80,21 @@ def hyperparameters_of(model: BaseAlgorithm) -> dict[str, bool | str | float]:
     return found
 
 
+class _LogarithmOfCosts(KVWriter):
+    """Writes what an evaluation costs as a logarithm, since returns are negative and have no logarithmic axis."""
+
+    def __init__(self, writer: SummaryWriter):
+        self.writer = writer
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        if (cost := -key_values.get("eval/mean_reward", 0.0)) > 0.0:
+            self.writer.add_scalar("eval/cost_log10", math.log10(cost), step)
+            self.writer.flush()
+
+    def close(self) -> None:
+        """Leave the file to the format whose it is."""
+
+
 class DashboardCallback(BaseCallback):
     """
     Callback that makes TensorBoard show this run and others of the same folder as one comparison. The training is not changed
@@ -100,14 +104,10 @@ class DashboardCallback(BaseCallback):
     - the hyperparameters for the HParams tab, where they stand beside the last value of each scalar of the run
     - ``rollout/cost_mean``, the mean of ``info["cost"]`` over the steps since the last entry, if the environment has costs;
       what is no finite number does not count
+    - ``eval/cost_log10``, the logarithm of what an episode of ``EvalCallback`` costs, which is minus its return
 
     Evaluations are left to ``EvalCallback`` (``eval/``), ``LyapunovCallback`` (``lyapunov/``, of LAC's critic) and
     ``CertificateCallback`` (``certificate/``, of any algorithm).
-
-    .. note::
-        ``HParam`` of Stable-Baselines3 is not used: it declares the columns of the table in each run, of which TensorBoard
-        takes those of one run for all, so that the table would lack what only another algorithm has. Without a declaration
-        TensorBoard puts together what it finds.
 
     :param charts: More charts, like ``battery_env.callbacks.CALIBRATION_CHARTS``. They come first. All runs should have
         the same.
@@ -139,7 +139,10 @@ class DashboardCallback(BaseCallback):
     def _on_training_start(self) -> None:
         writer = tensorboard_writer(self.logger)
         assert writer is not None and writer.file_writer is not None
+        if not any(isinstance(output, _LogarithmOfCosts) for output in self.logger.output_formats):
+            self.logger.output_formats.append(_LogarithmOfCosts(writer))
         writer.add_custom_scalars(self.charts)
+        # HParam of Stable-Baselines3 declares columns in each run, of which TensorBoard takes those of one run for all
         _, start, end = hparams_summaries({**hyperparameters_of(self.model), **self.hparams}, metric_dict={})
         writer.file_writer.add_summary(start)
         writer.file_writer.add_summary(end)

@@ -80,6 +80,8 @@ def run_briefly(source, name, folder, monkeypatch):
         source = re.sub(r"(fit_life\(load_nasa_discharges\(\"\w+\"\))\)", r"\1[::20])", source)
         source = re.sub(r"\.along\(path, \d+", ".along(path, 20", source)
     source = re.sub(r"\.learn\((total_timesteps=)?[\d_.e]+", r".learn(\g<1>150", source)
+    source = re.sub(r"\beval_freq=[\d_]+", "eval_freq=100", source)
+    source = re.sub(r"\bfor seed in range\(\d+\)", "for seed in range(1)", source)
     source = re.sub(r"\bn_steps: int = [\d_]+", "n_steps: int = 520", source)
     source = re.sub(r"\b(n_envs|n_episodes|n_eval_episodes)=\d+", r"\1=10", source)
     source = re.sub(r"\bn_episodes_per_start=\d+", "n_episodes_per_start=2", source)
