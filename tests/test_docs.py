@@ -111,11 +111,6 @@ def test_examples_in_pages_run_and_print_what_they_show(page, tmp_path, monkeypa
             assert text in printed
 
 
-@pytest.mark.parametrize("name", ["first_controller", "first_discharge", "own_problem", "cell_life"])
-def test_tutorials_show_what_they_print(name):
-    assert blocks(DOCS / f"{name}.md", "text")
-
-
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
 def test_example_files_run(example, tmp_path, monkeypatch):
     for package in OPTIONAL.get(example.name, ()):
