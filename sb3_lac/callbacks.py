@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import os
 from copy import deepcopy
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import gymnasium as gym
@@ -12,7 +10,6 @@ from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_lac.dashboard import NOT_TENSORBOARD, tensorboard_writer
-from sb3_lac.files import replacing
 from sb3_lac.stability import (
     CertificationReport,
     LyapunovFunction,
@@ -50,10 +47,8 @@ class LyapunovCallback(EventCallback):
     :param n_eval_episodes: The number of episodes to test the agent
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param seed: Seed of each evaluation, so that all of them have the same start states; if it is None, each draws its own
-    :param log_path: Path of a CSV file with the metrics and their confidence intervals, updated at each evaluation.
-        If it exists already, its evaluations are kept, so that the history of a continued training is complete
-        (``learn(..., reset_num_timesteps=False)``). A training that starts anew is refused, whose evaluations it would mix in.
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
+    :ivar history: What was logged of each evaluation of the training, with all intervals
     """
 
     #: Before the names of what is logged
@@ -71,7 +66,6 @@ class LyapunovCallback(EventCallback):
         n_eval_episodes: int = 20,
         eval_freq: int = 10_000,
         seed: int | None = None,
-        log_path: str | os.PathLike[str] | None = None,
         verbose: int = 1,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
@@ -79,8 +73,6 @@ class LyapunovCallback(EventCallback):
         self.n_eval_episodes = n_eval_episodes
         self.eval_freq = eval_freq
         self.seed = seed
-        self.log_path = None if log_path is None else Path(log_path)
-        # One entry per evaluation, by timesteps
         self.history: list[dict[str, float]] = []
         self.last_report: LyapunovReport | None = None
         # What the callbacks of Stable-Baselines3 that stop a training ask for
@@ -90,28 +82,12 @@ class LyapunovCallback(EventCallback):
         # A mistake is seen before the training, and not at its first evaluation
         with closed_loop(self.model, self.eval_env, self._judged(), self.n_eval_episodes, seed=self.seed) as loop:
             self.eval_env = loop.env
-        if self.log_path is not None:
-            self._continue_log(self.log_path)
         # Not of another training, nor of steps that are taken again from a checkpoint on
         self.history = [entry for entry in self.history if entry["timesteps"] <= self.model.num_timesteps]
 
     def _judged(self) -> LyapunovFunction | None:
         """Return the function that is judged, if it is known before the evaluation."""
         return critic_of(self.model)
-
-    def _continue_log(self, path: Path) -> None:
-        import pandas as pd  # slow to import, and only an evaluation needs it
-
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not path.exists() or path.stat().st_size == 0:
-            return
-        if self.model.num_timesteps == 0:
-            raise ValueError(
-                f"log_path={path} holds the evaluations of another training, and this one starts anew: move the file away, "
-                "give another path, or continue with learn(..., reset_num_timesteps=False)."
-            )
-        records = pd.read_csv(path).to_dict("records")
-        self.history = [{str(name): value for name, value in record.items()} for record in records]
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
@@ -128,11 +104,6 @@ class LyapunovCallback(EventCallback):
         values = self._values()
         self._log(values)
         self.history.append({"timesteps": self.num_timesteps, **values})
-        if self.log_path is not None:
-            import pandas as pd
-
-            with replacing(self.log_path) as part:
-                pd.DataFrame(self.history).to_csv(part, index=False)
         if self.verbose >= 1:
             print(f"Eval num_timesteps={self.num_timesteps}, {self._summary()}")
 
@@ -188,7 +159,6 @@ class CertificateCallback(LyapunovCallback):
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param ultimate_bound: The cost to stay within, the largest late cost of the roll-outs of the fit by default
     :param seed: Seed of each evaluation, far from those of the training; if it is None, each draws its own
-    :param log_path: Path of a CSV file, as for ``LyapunovCallback``
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
 
@@ -205,10 +175,9 @@ class CertificateCallback(LyapunovCallback):
         eval_freq: int = 10_000,
         ultimate_bound: float | None = None,
         seed: int | None = 10_000,
-        log_path: str | os.PathLike[str] | None = None,
         verbose: int = 1,
     ):
-        super().__init__(eval_env, callback_after_eval, n_eval_episodes, eval_freq, seed, log_path, verbose)
+        super().__init__(eval_env, callback_after_eval, n_eval_episodes, eval_freq, seed, verbose)
         check_bound(ultimate_bound)
         self.ultimate_bound = ultimate_bound
         self.last_certification: CertificationReport | None = None

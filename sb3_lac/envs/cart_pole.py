@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative
+from sb3_lac.envs.base import CostEnv
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +54,6 @@ class CartPoleCostEnv(CostEnv):
     | `pole_mass_kg` | 0.1 | mass of the pole |
     | `pole_half_length_m` | 0.5 | half the length of the pole |
     | `force_max_N` | 20.0 | force of action 1 |
-    | `impulse_N` | 0.0 | another name of `impulse` |
 
     and the [disturbances](../cost_environments.md#disturbances) of all cost environments. `impulse` is a force on the cart
     (N).
@@ -89,7 +88,6 @@ class CartPoleCostEnv(CostEnv):
         pole_mass_kg: float = 0.1,
         pole_half_length_m: float = 0.5,
         force_max_N: float = 20.0,
-        impulse_N: float = 0.0,
         **options: Any,
     ) -> None:
         parameters = {
@@ -98,9 +96,6 @@ class CartPoleCostEnv(CostEnv):
             "pole_half_length_m": pole_half_length_m,
             "force_max_N": force_max_N,
         }
-        check_not_negative(impulse_N=impulse_N)
-        if impulse_N > 0 and options.setdefault("impulse", impulse_N) != impulse_N:
-            raise ValueError(f"impulse_N={impulse_N} and impulse={options['impulse']} are the same: give one of them.")
         state_high = np.array([2 * self.X_MAX_M, 1000.0, 1.0, 1000.0])
         observation_space = spaces.Box(-state_high.astype(np.float32), state_high.astype(np.float32))
         super().__init__(parameters, -state_high, state_high, observation_space, n_actions=1, **options)

@@ -101,13 +101,8 @@ def spread(n: np.ndarray, x: np.ndarray, xx: np.ndarray) -> np.ndarray:
 
 
 def slope(n: np.ndarray, x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> np.ndarray:
-    """Slope of the least squares line, of sums as ``intercept()`` and ``correlation()``."""
+    """Slope of the least squares line, of sums as ``correlation()``."""
     return ratio(n * xy - x * y, spread(n, x, xx))
-
-
-def intercept(n: np.ndarray, x: np.ndarray, y: np.ndarray, *squares: np.ndarray) -> np.ndarray:
-    """Intercept of the least squares line."""
-    return ratio(y - slope(n, x, y, *squares) * x, n)
 
 
 def correlation(n: np.ndarray, x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray) -> np.ndarray:
@@ -237,12 +232,10 @@ def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstra
         "largest_feasible_alpha3": bootstrap.estimate(ratio, known["episode"], decreases, known["cost"]),
         "mean_cost": bootstrap.estimate(ratio, transitions["episode"], transitions["cost"], np.ones(len(transitions))),
         "calibration_slope": compare(slope, lyapunov, costs_to_go),
-        "calibration_intercept": compare(intercept, lyapunov, costs_to_go),
         # Spearman's correlation is Pearson's of the ranks, the bootstrap keeps the ranks among all transitions
         "rank_correlation": compare(correlation, rankdata(lyapunov), rankdata(costs_to_go)),
         "ultimate_bound": exact_percentile(episodes.loc[~episodes["terminated"], "largest_late_cost"].to_numpy(), 95),
         "death_rate": Interval(n_deaths / len(episodes), float(wilson.low), float(wilson.high)),
-        "decrease_rate": bootstrap.estimate(ratio, known["episode"], decreases, known["lyapunov"]),
         "start_cost": bootstrap.estimate(ratio, starts["episode"], starts["cost"], np.ones(len(starts))),
         "late_cost": bootstrap.estimate(ratio, survivors.index, survivors["late_cost"], np.ones(len(survivors))),
         "late_rise": bootstrap.estimate(ratio, long.index, long["late_rise"], np.ones(len(long))),

@@ -498,7 +498,6 @@ def test_exact_value_is_the_mean_discounted_sum_of_costs():
         (VehicleCostEnv, {"last_actions": -1}, "last_actions=-1 must be finite and at least 0"),
         (QuadrotorCostEnv, {"action_delay": 0.5}, "action_delay=0.5 must be a whole number"),
         (VehicleCostEnv, {"steering_max_rad": 1.5}, "steering_max_rad=1.5 must be at most 1"),
-        (CartPoleCostEnv, {"impulse_N": 1.0, "impulse": 2.0}, "are the same: give one of them"),
         (LinearCostEnv, {"noise_std": np.nan}, "noise_std=nan must be finite and at least 0"),
         (LinearCostEnv, {"render_mode": "human"}, "render_mode='human' must be one of"),
     ],
