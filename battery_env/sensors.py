@@ -5,15 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, get_args
 
 import numpy as np
 
 from battery_env.electrochemistry import FloatArray, Trajectory
-
-#: What is measured beside the voltage: the current, or the power, of which the current is that over the measured voltage.
-Measured = Literal["current", "power"]
-_MEASURED = get_args(Measured)
 
 
 @dataclass(frozen=True)
@@ -25,7 +20,6 @@ class SensorErrors:
     :param offset_V: constant error of the voltage, V
     :param current_gain: reading of the current sensor per true current; 1.01 reads 1 % too much
     :param current_offset_A: constant error of the current, A
-    :param measured: ``"current"``; or ``"power"``: the current is the power, read exactly, over the measured voltage
     :raises ValueError: for a value that is not finite, or negative noise, or a gain that is not positive
     """
 
@@ -33,10 +27,8 @@ class SensorErrors:
     offset_V: float = 0.0
     current_gain: float = 1.0
     current_offset_A: float = 0.0
-    measured: Measured = "current"
 
     def __post_init__(self) -> None:
-        _check_measured(self.measured)
         for name in ("noise_V", "offset_V", "current_gain", "current_offset_A"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)!r}")
@@ -44,11 +36,6 @@ class SensorErrors:
             raise ValueError(f"noise_V is a standard deviation and must be at least 0 V, got {self.noise_V!r}")
         if self.current_gain <= 0.0:
             raise ValueError(f"current_gain must be greater than 0 (1: exact), got {self.current_gain!r}")
-
-    @property
-    def change_the_current(self) -> bool:
-        """Whether the current that is read is not the true one."""
-        return (self.current_gain, self.current_offset_A, self.measured) != (1.0, 0.0, "current")
 
     def draw(self, rng: np.random.Generator) -> SensorErrors:
         """The errors of one discharge: these, whatever ``rng``."""
@@ -58,17 +45,11 @@ class SensorErrors:
         """The voltage as it is read, where ``noise`` is standard normal; any shape."""
         return voltage_V + self.noise_V * noise + self.offset_V
 
-    def gain(self, voltage_V: FloatArray, read_V: FloatArray) -> FloatArray:
-        """The factor of the current before its offset is added, where the voltage is ``voltage_V`` and read as ``read_V``."""
-        gain = np.full_like(voltage_V, self.current_gain)
-        return gain * (voltage_V / read_V) if self.measured == "power" else gain
-
     def apply(self, trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
         """Read the voltage and the current of a discharge with these errors; ``rng`` draws the noise."""
-        voltage_V = trajectory.voltage_V
-        read_V = self.read_voltage_V(voltage_V, rng.standard_normal(len(voltage_V)))
-        current_A = self.gain(voltage_V, read_V) * trajectory.current_A + self.current_offset_A
-        return replace(trajectory, voltage_V=read_V, current_A=current_A)
+        voltage_V = self.read_voltage_V(trajectory.voltage_V, rng.standard_normal(len(trajectory.voltage_V)))
+        current_A = self.current_gain * trajectory.current_A + self.current_offset_A
+        return replace(trajectory, voltage_V=voltage_V, current_A=current_A)
 
 
 @dataclass(frozen=True)
@@ -80,7 +61,6 @@ class RandomSensorErrors:
     :param offset_V: the offset of the voltage is drawn uniformly within this to either side, V
     :param current_gain: likewise the relative error of the current's gain
     :param current_offset_A: likewise the offset of the current, A
-    :param measured: as of :class:`SensorErrors`
     :raises ValueError: for values that are negative, too large for a sensor, or in the wrong order
     """
 
@@ -88,10 +68,8 @@ class RandomSensorErrors:
     offset_V: float = 0.0
     current_gain: float = 0.0
     current_offset_A: float = 0.0
-    measured: Measured = "current"
 
     def __post_init__(self) -> None:
-        _check_measured(self.measured)
         least, greatest = self.noise_V
         if not (0.0 < least <= greatest < 1.0 or least == greatest == 0.0):
             raise ValueError(
@@ -120,9 +98,4 @@ class RandomSensorErrors:
             rng.uniform(-bound, bound) if bound > 0.0 else 0.0
             for bound in (self.offset_V, self.current_gain, self.current_offset_A)
         )
-        return SensorErrors(noise_V, offset_V, 1.0 + gain, offset_A, self.measured)
-
-
-def _check_measured(measured: str) -> None:
-    if measured not in _MEASURED:
-        raise ValueError(f"measured must be one of {_MEASURED}, got {measured!r}")
+        return SensorErrors(noise_V, offset_V, 1.0 + gain, offset_A)

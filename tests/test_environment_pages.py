@@ -64,7 +64,7 @@ def test_the_table_of_arguments_is_that_of_the_options(env_id):
     rows = re.findall(r"^\| ``(\w+)`` \| (.*?) \|", PAGES[env_id], flags=re.MULTILINE)
     written = {name: None if default == "none" else ast.literal_eval(default.strip("`")) for name, default in rows}
     # what the class decides
-    decided = {"episode_steps": BatteryQmax.episode_steps, "cost_limit": BatteryQmax.formulation.cost_limit}
+    decided = {"episode_steps": BatteryQmax.episode_steps}
     expected = {
         name: decided[name] if default is None and name in decided else default for name, default in task.options().items()
     }

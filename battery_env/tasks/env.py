@@ -50,13 +50,6 @@ def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:
     )
 
 
-def check_render_mode(render_mode: str | None) -> str | None:
-    """Refuse a render mode that does not exist."""
-    if render_mode is not None and render_mode not in _RENDER_MODES:
-        raise ValueError(f"render_mode must be None or one of {_RENDER_MODES}, got {render_mode!r}")
-    return render_mode
-
-
 class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
     A calibration task for one cell. The reward is minus the cost, and ``info`` holds the cost and what
@@ -79,7 +72,9 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     }
 
     def __init__(self, task: str | type[CalibrationTask], render_mode: str | None = None, **options: Any) -> None:
-        self.render_mode = check_render_mode(render_mode)
+        if render_mode not in (None, *_RENDER_MODES):
+            raise ValueError(f"render_mode must be None or one of {_RENDER_MODES}, got {render_mode!r}")
+        self.render_mode = render_mode
         self.task = new_task(task, 1, options)
         self.observation_space, self.action_space = spaces_of(self.task)
         self._history: deque[dict[str, float]] = deque(maxlen=int(self.task.episode_steps))

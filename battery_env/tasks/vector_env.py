@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from battery_env.electrochemistry import FloatArray
 from battery_env.tasks.base import CalibrationTask
-from battery_env.tasks.env import CalibrationEnv, check_render_mode, new_task, spaces_of
+from battery_env.tasks.env import CalibrationEnv, new_task, spaces_of
 
 Mask = NDArray[np.bool_]
 
@@ -32,20 +31,18 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
     :param autoreset_mode: when a cell whose episode is over is started again: ``NEXT_STEP``: by the step that follows, whose
         action does nothing to it; ``SAME_STEP``: at once, with ``final_obs`` and ``final_info`` in ``info``; ``DISABLED``: by
         the caller, with ``reset(options={"reset_mask": ...})``. The mode or its value, a string
-    :param render_mode: ``"rgb_array"`` or ``None``
     :param options: of the task
     :raises TypeError: for an option that the task does not have
     :raises ValueError: for values out of range
     """
 
-    metadata: dict[str, Any] = dict(CalibrationEnv.metadata)  # noqa: RUF012 (as in gym.vector.VectorEnv)
+    metadata: dict[str, Any] = {"discount": CalibrationEnv.metadata["discount"]}  # noqa: RUF012 (as in gym.vector.VectorEnv)
 
     def __init__(
         self,
         task: str | type[CalibrationTask],
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        render_mode: str | None = None,
         **options: Any,
     ) -> None:
         if num_envs < 1:
@@ -53,14 +50,12 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.render_mode = check_render_mode(render_mode)
         self.task = new_task(task, num_envs, options)
         self.single_observation_space, self.single_action_space = spaces_of(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators: list[np.random.Generator] = []
         self._over: Mask = np.zeros(num_envs, dtype=np.bool_)
-        self._histories = [deque[dict[str, float]](maxlen=self.task.episode_steps) for _ in range(num_envs)]
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -120,20 +115,8 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
             cost[started] = 0.0
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._over = truncated.copy()
-        info = self._info(cost)
-        if self.render_mode is not None:
-            self._remember(info, started)
-        return self.task.observation(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, {**final, **info}
-
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """
-        Pictures of the episodes so far of every cell, as the scalar environment draws them, or ``None`` without a render mode.
-        """
-        if self.render_mode is None:
-            return None
-        from battery_env.tasks.rendering import draw_frame  # matplotlib only for those who look
-
-        return tuple(draw_frame(history, self.task) for history in self._histories)
+        info = {**final, **self._info(cost)}
+        return self.task.observation(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, info
 
     def _checked_mask(self, mask: Any) -> Mask:
         if not (isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,) and mask.any()):
@@ -144,11 +127,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
 
     def _start(self, mask: Mask, options: Mapping[str, Any] | None = None) -> None:
         rows = np.flatnonzero(mask)
-        cells = rows.tolist()
-        self.task.start(rows, [self._generators[n] for n in cells], options)
-        if self.render_mode is not None:
-            for n in cells:
-                self._histories[n].clear()
+        self.task.start(rows, [self._generators[n] for n in rows.tolist()], options)
 
     def _info(self, cost: FloatArray, mask: Mask | None = None) -> dict[str, Any]:
         info: dict[str, Any] = {"cost": cost, **self.task.report()}
@@ -162,8 +141,3 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
             observations[n] = observation[n]
         final = self._info(cost.copy(), mask)
         return {"final_obs": observations, "_final_obs": mask.copy(), "final_info": final, "_final_info": mask.copy()}
-
-    def _remember(self, info: dict[str, Any], started: Mask | None) -> None:
-        names = ("cost", *self.task.REPORTED)
-        for n in range(self.num_envs) if started is None else np.flatnonzero(~started):
-            self._histories[n].append({name: float(info[name][n]) for name in names})

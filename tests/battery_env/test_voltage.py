@@ -116,9 +116,7 @@ class TestTask:
         variance = sum(1e-8 / (1.0 - (1.0 - 1.0 / tau) ** 2) for tau in (NEW_CELL.to, NEW_CELL.tsn, NEW_CELL.tsp))
         assert np.std(errors_V(process_noise_V=1e-4, **EXACT)) == pytest.approx(np.sqrt(variance), rel=0.3)
 
-    @pytest.mark.parametrize(
-        "fault", [{"current_gain": 0.1}, {"current_offset_A": 0.3}, {"offset_V": 0.3}, {"offset_V": 0.3, "measured": "power"}]
-    )
+    @pytest.mark.parametrize("fault", [{"current_gain": 0.1}, {"current_offset_A": 0.3}, {"offset_V": 0.3}])
     def test_training_sees_what_evaluation_shows(self, data, fault):
         """An episode looks like a record to which the same errors were applied."""
         sensors = {**EXACT, **fault}
@@ -164,7 +162,6 @@ class TestTask:
             ({"offset_V": -0.01}, "offset_V must be at least 0 and less than 0.5, got -0.01"),
             ({"process_noise_V": np.nan}, "process_noise_V must be .*, got nan"),
             ({"start": "new"}, "start must be one of .*, got 'new'"),
-            ({"measured": "voltage"}, "measured must be one of .*, got 'voltage'"),
             ({"nuisance": -0.1}, "nuisance must be finite and at least 0, got -0.1"),
             ({"cell": {"kn": 1.0}}, "cell must be CellParameters or None"),
             ({"load": "constant"}, "dataset stands in place of load"),

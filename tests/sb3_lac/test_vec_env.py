@@ -186,9 +186,7 @@ def test_attributes_and_methods_of_single_environments(problems):
 
 
 def test_an_environment_that_computes_all_at_once(discharges):
-    vector = gym.make_vec(
-        "BatteryQmax-v0", num_envs=N_ENVS, autoreset_mode="SameStep", render_mode="rgb_array", dataset=discharges
-    )
+    vector = gym.make_vec("BatteryQmax-v0", num_envs=N_ENVS, autoreset_mode="SameStep", dataset=discharges)
     # Wrappers of Gymnasium hide what they hold
     env = GymnasiumVecEnv(gym.wrappers.vector.RecordEpisodeStatistics(vector))
     assert env.get_attr("num_envs", indices=[0, 1]) == [N_ENVS] * 2 and not env.has_attr("gravity")
@@ -202,8 +200,6 @@ def test_an_environment_that_computes_all_at_once(discharges):
     assert (first != second).any()
     env.seed(1)
     np.testing.assert_array_equal(env.reset(), first)
-    env.step(np.zeros((N_ENVS, 1)))
-    assert env.render_mode == "rgb_array" and env.render("rgb_array").ndim == 3
     env.close()
     assert vector.closed
 

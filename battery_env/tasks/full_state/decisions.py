@@ -60,21 +60,18 @@ def _cost_of_state(model_state: FloatArray, measured: FloatArray, n: int, task: 
 
 
 @inlined
-def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> float:
-    # Set the model's parameters; returns the length of the change of the action
-    cell, squared_change, column = cells[n], 0.0, 0
+def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> None:
+    # Set the model's parameters
+    cell, column = cells[n], 0
     for k in range(2):
         if task.finds[k] > 0:
             chosen = _clipped(action[n, column], 1.0)
-            squared_change += (chosen - cell.last_action[k]) ** 2
-            cell.last_action[k] = chosen
             value = task.lowest[k] + 0.5 * (chosen + 1.0) * (task.highest[k] - task.lowest[k])
             if k == 0:
                 cell.q_mobile_hat = value
             else:
                 cell.r_o_hat = value
             column += 1
-    return sqrt(squared_change)
 
 
 @compiled
@@ -85,17 +82,14 @@ def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArr
     for n in range(len(cells)):
         cells[n].decisions += 1
         cells[n].sample += 1
-        cost[n] = task.consistency * _take_action(action, task, cells, n)
+        _take_action(action, task, cells, n)
     load, q, r_o = cells["load"], cells["q_mobile_hat"], cells["r_o_hat"]
     packed = PackedConstants(task.constants, task.polynomial_n, task.polynomial_p)
     step_batch(model_state, load, q, r_o, task.dt_s, task.power, task.thermal, True, packed, model_state)
     for n in range(len(cells)):
-        cost[n] += _cost_of_state(model_state, next_state, n, task)
-        is_set = task.resync > 0 and cells[n].decisions % task.resync == 0
+        cost[n] = _cost_of_state(model_state, next_state, n, task)
         for k in range(STATE_SIZE):
             state[n, k] = next_state[n, k]
-            if is_set:
-                model_state[n, k] = next_state[n, k]
 
 
 @compiled
@@ -126,12 +120,6 @@ def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.flo
             out[n, k] = _clipped(model_state[n, k + 1] * per_state[k], limit)
             out[n, k + 7] = _clipped(next_state[n, k + 1] * per_state[k], limit)
         out[n, 14] = _clipped(cell.load * task.per_load, limit)
-        if task.shows_action:
-            column = out.shape[1]
-            for k in range(1, -1, -1):
-                if task.finds[k] > 0:
-                    column -= 1
-                    out[n, column] = cell.last_action[k]
     if not task.innovations:
         return
     q, r_o = np.full(len(cells), task.new_parameters[0]), np.full(len(cells), task.new_parameters[1])

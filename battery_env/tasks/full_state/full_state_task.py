@@ -57,8 +57,7 @@ class FullStateTask(CalibrationTask):
     The paper's task for ``cells`` cells side by side. The state of the cell is measured. One parameter is to be found and the
     other one is known, or both are to be found. The agent picks them for the model, which then takes one step from its own
     state x̂_t under the load. The cost is how far a voltage of its state, or all of it, is from the measured x_{t+1}. The
-    registered tasks differ in attributes of their classes. The page of
-    The page of ``BatteryQmax-v0`` describes the options.
+    registered tasks differ in attributes of their classes. The page of ``BatteryQmax-v0`` describes the options.
 
     The cell is simulated beside the model, from the parameters and loads of the data set. The model is extended where a wrong
     parameter leaves its domain (:func:`battery_env.electrochemistry.step_into`, ``extended``).
@@ -82,30 +81,21 @@ class FullStateTask(CalibrationTask):
         continue_probability: float = 0.0,
         first_sample_probability: float = 0.0,
         initial_perturbation: float = 0.0,
-        resync: int | None = None,
-        consistency: float = 0.0,
-        cost_limit: float | None = None,
         load: LoadKind = "paper",
         split: Split = "train",
         dt_s: float = 1.0,
         mismatch: float = 0.0,
         dataset: TrajectoryDataset | str | os.PathLike[str] | None = None,
     ) -> None:
-        limit = self.formulation.cost_limit if cost_limit is None else cost_limit
-        if resync is not None and resync < 1:
-            raise ValueError(f"resync must be None or at least 1, got {resync!r}")
         check_not_negative(
             continue_probability=continue_probability,
             first_sample_probability=first_sample_probability,
             initial_perturbation=initial_perturbation,
-            consistency=consistency,
         )
         if continue_probability >= 1.0:
             raise ValueError(f"continue_probability must be less than 1, or episodes never end, got {continue_probability!r}")
         if first_sample_probability > 1.0:
             raise ValueError(f"first_sample_probability must be at most 1, got {first_sample_probability!r}")
-        if not 0.0 < limit < np.inf:
-            raise ValueError(f"cost_limit must be finite and greater than 0, got {limit!r}")
         self.cells = cells
         self.episode_steps = self.episode_steps if episode_steps is None else episode_steps
         check_counts(episode_steps=self.episode_steps)
@@ -119,9 +109,7 @@ class FullStateTask(CalibrationTask):
         self.continue_probability, self.first_sample_probability = continue_probability, first_sample_probability
         self.initial_perturbation = initial_perturbation
         self.observation_size = (4 if self.formulation.innovations else 2) * OBSERVED_SIZE + 1
-        self.observation_size += len(self.parameters) if consistency > 0.0 else 0
-        self._settings = self._kernel_settings(limit, consistency, resync or 0)
-        self._first_action = self.action_of({name: getattr(NEW_CELL, name) for name in self.parameters})
+        self._settings = self._kernel_settings()
         self._starts = list(zip(self.dataset.first.tolist(), (self.dataset.stop - 2).tolist(), strict=True))
         self._has_own_constants = bool((self.dataset.factors != 1.0).any())
         if self.dataset.equilibrium_V.any():
@@ -130,7 +118,7 @@ class FullStateTask(CalibrationTask):
         first = nowhere + self.dataset.first[0]
         self.now = self._begin(nowhere, first, nowhere + self.episode_steps, np.zeros((cells, 4)))
 
-    def _kernel_settings(self, cost_limit: float, consistency: float, resync: int) -> Records:
+    def _kernel_settings(self) -> Records:
         form, dataset = self.formulation, self.dataset
         settings = np.zeros(1, dtype=SETTINGS)
         for name, value in {
@@ -142,16 +130,13 @@ class FullStateTask(CalibrationTask):
             "finds": [name in self.parameters for name in PARAMETER_NAMES],
             "lowest": [form.action_ranges[name][0] for name in PARAMETER_NAMES],
             "highest": [form.action_ranges[name][1] for name in PARAMETER_NAMES],
-            "resync": resync,
             "literal_cost": form.literal_cost,
-            "cost_limit": cost_limit,
+            "cost_limit": form.cost_limit,
             "judged_by": [JUDGED_BY[name] for name in PARAMETER_NAMES],
-            "consistency": consistency,
             "per_state": 1.0 / form.state_scale,
             "per_load": 1.0 / form.load_scale,
             "per_error": 1.0 / ERROR_SCALE,
             "innovations": form.innovations,
-            "shows_action": consistency > 0.0,
         }.items():
             settings[name] = value
         return settings
@@ -204,7 +189,6 @@ class FullStateTask(CalibrationTask):
         # before the first action the model is a new cell in what is to be found; what is known is the true value
         for name in PARAMETER_NAMES:
             cells[f"{name}_hat"] = getattr(NEW_CELL, name) if name in self.parameters else cells[name]
-        cells["last_action"][:, self._settings["finds"][0] > 0] = self._first_action
         cells["state"] = dataset.states_at(trajectory, sample)
         cells["model_state"] = cells["state"]
         if self.initial_perturbation > 0.0:
@@ -267,7 +251,7 @@ class FullStateTask(CalibrationTask):
     def observation(self) -> NDArray[np.float32]:
         """
         s_t = [x̂_t, x_{t+1}, u_{t+1}] and, with innovations, asinh of x_{t+1} - f(x̂_t, u_{t+1}; new cell) and of
-        x_{t+1} - f(x_t, u_{t+1}; new cell), all scaled; with a price on changes of the action, the action before.
+        x_{t+1} - f(x_t, u_{t+1}; new cell), all scaled.
         """
         out = np.empty((self.cells, self.observation_size), dtype=np.float32)
         observe(self._settings, self.now, OBSERVATION_LIMIT, out)

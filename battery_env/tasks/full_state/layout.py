@@ -91,16 +91,13 @@ SETTINGS = np.dtype(
         ("finds", np.int64, (2,)),  # 1 where a parameter is to be found
         ("lowest", float, (2,)),  # what an action of -1 stands for
         ("highest", float, (2,)),
-        ("resync", np.int64),  # 0: never
         ("literal_cost", bool),
         ("cost_limit", float),
         ("judged_by", np.int64, (2,)),  # index of a voltage
-        ("consistency", float),
         ("per_state", float, (OBSERVED_SIZE,)),
         ("per_load", float),
         ("per_error", float, (OBSERVED_SIZE,)),
         ("innovations", bool),
-        ("shows_action", bool),
     ],
     align=True,
 )
@@ -124,7 +121,6 @@ CELL = np.dtype(
         ("r_o", float),  # of the cell, ohm
         ("q_mobile_hat", float),  # of the model, C
         ("r_o_hat", float),  # of the model, ohm
-        ("last_action", float, (2,)),  # 0 for a parameter that is known
     ]
 )
 #: Likewise, of a cell whose constants are not the model's.

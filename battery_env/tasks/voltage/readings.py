@@ -25,10 +25,8 @@ from battery_env.electrochemistry import (
     simulate,
 )
 from battery_env.electrochemistry.cell import (
-    BULK_RATE,
     CONSTANTS_SIZE,
     POLYNOMIAL_SIZE,
-    SURFACE_RATE,
     SURROUNDINGS,
     TSN_RATE,
     TSP_RATE,
@@ -182,49 +180,28 @@ class Readings:
             model[name] = value
         return model
 
-    def _left(self, discharge: int, time_constant_s: float) -> FloatArray:
-        """What is left after each interval of a quantity that decays, in the model's own steps."""
-        return np.asarray((1.0 - self.dt_s / time_constant_s) ** self._steps[self.part(discharge)])
-
     def process_noise_V(self, discharge: int, deviation: float, draws: FloatArray) -> FloatArray:
         """What white noise on Vo, Vsn and Vsp of a cell adds to its voltage at the readings of one discharge."""
         cell, dt_s = self.cell, self.dt_s
         total = np.zeros(draws.shape[1])
         for draw, time_constant_s in zip(draws, (cell.to, cell.tsn, cell.tsp), strict=True):
-            left = self._left(discharge, time_constant_s)
+            # what is left after each interval of a quantity that decays
+            left = (1.0 - dt_s / time_constant_s) ** self._steps[self.part(discharge)]
             # the variance of a sum of steps that decay on the way, over one interval
             variance = dt_s * (1.0 - left**2) / (1.0 - (1.0 - dt_s / time_constant_s) ** 2)
             total -= _filtered(deviation * np.sqrt(variance) * draw, left)
         return total
 
-    def remeasured(self, discharge: int, gain: FloatArray, offset_A: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """
-        What another current sensor makes of one discharge. All is linear in the current: what each interval adds to the
-        states is multiplied by its gain, and what a constant current adds is added.
-        """
+    def remeasured(self, discharge: int, gain: float, offset_A: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What another current sensor makes of one discharge: all is linear in the current."""
         part = self.part(discharge)
-        constants = self.cell.packed.constants[0]
-        rate = constants[BULK_RATE] + constants[SURFACE_RATE]
-        stay, at_rest = self._left(discharge, 1.0 / rate), constants[BULK_RATE] / rate
-        steps = self._steps[part].astype(np.int64)
-        unit = _linear_part(np.ones(int(steps.max())), np.arange(1, int(steps.max()) + 1), self.dt_s, self.cell)
-        _, moved_by_unit, ohmic_by_unit = (column[steps - 1] for column in unit)
-        before = np.concatenate([[0.0], self.drawn_C[part][:-1]])
-
-        def refiltered(
-            values: FloatArray, left: FloatArray, free: FloatArray, by_unit: FloatArray, free_now: FloatArray
-        ) -> FloatArray:
-            added = values - left * np.concatenate([[0.0], values[:-1]]) - free
-            return np.asarray(_filtered(gain * added + offset_A * by_unit + free_now, left))
-
-        drawn_C = np.cumsum(gain * np.diff(self.drawn_C[part], prepend=0.0) + offset_A * self.dt_s * steps)
-        # charge that is missing in the bulk flows after what has left the surface
-        to_rest = (1.0 - stay) * at_rest
-        before_now = np.concatenate([[0.0], drawn_C[:-1]])
-        moved_C = refiltered(self.moved_C[part], stay, to_rest * before, moved_by_unit, to_rest * before_now)
-        nothing = np.zeros_like(before)
-        ohmic_A = refiltered(self.ohmic_A[part], self._left(discharge, self.cell.to), nothing, ohmic_by_unit, nothing)
-        return gain * self.current_A[part] + offset_A, moved_C, ohmic_A
+        steps = np.rint(self.time_s[part] / self.dt_s).astype(np.int64)
+        _, moved_by_unit, ohmic_by_unit = _linear_part(np.ones(int(steps[-1])), steps, self.dt_s, self.cell)
+        return (
+            gain * self.current_A[part] + offset_A,
+            gain * self.moved_C[part] + offset_A * moved_by_unit,
+            gain * self.ohmic_A[part] + offset_A * ohmic_by_unit,
+        )
 
 
 @compiled

@@ -331,11 +331,10 @@ class VoltageTask(CalibrationTask):
         noise_V = self.sensors.draw_noise_V(generator)
         noise = generator.standard_normal(length) if noise_V > 0.0 else np.zeros(length)
         errors = self.sensors.draw_biases(generator, noise_V)
-        read_V = errors.read_voltage_V(voltage_V, noise)
-        if errors.change_the_current:
-            measured = self.readings.remeasured(discharge, errors.gain(voltage_V, read_V), errors.current_offset_A)
+        voltage_V[:] = errors.read_voltage_V(voltage_V, noise)
+        if (errors.current_gain, errors.current_offset_A) != (1.0, 0.0):
+            measured = self.readings.remeasured(discharge, errors.current_gain, errors.current_offset_A)
             self._shown[CURRENT : OHMIC + 1, row, :length] = measured
-        voltage_V[:] = read_V
 
     def _explain(self, rows: Rows | None = None) -> None:
         """Compare some cells with their readings, all by default."""
