@@ -32,7 +32,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import itertools
-import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
@@ -241,13 +240,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(str(error))
     try:
         study.run(part, [{"recipe": asdict(recipe)} for of_seed in recipes for recipe in of_seed], out=study.out)
-    except Exception:
-        try:
-            report(study)  # of those that finished
-        except Exception as error:
-            sys.stderr.write(f"and the tables of what finished failed: {error!r}\n")
-        raise
-    report(study)
+    finally:
+        report(study)  # of those that finished
 
 
 if __name__ == "__main__":

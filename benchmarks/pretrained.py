@@ -1,19 +1,15 @@
 """
-Make the policies that come with ``battery_env``: LAC, trained on simulated cells whose constants are not the model's, as ONNX
-files with a card each that says what made them and what they are worth.
+Make the policy for simulated cells that comes with ``battery_env``: LAC, trained on cells whose constants are not the model's,
+as an ONNX file with a card that says what made it and what it is worth.
 
 .. code-block:: bash
 
-  python -m benchmarks.pretrained
   python -m benchmarks.pretrained --envs BatteryVoltageJoint-v0 --updates 16000 --out results/pretrained_joint
-  python -m benchmarks.pretrained --recorded --out results/pretrained_recorded
 
-Files and cards are shipped from ``battery_env/policies/pretrained_policies``, Joint from the second command, and those of one
-parameter for recorded cells, whose models are wrong in more ways than in their constants, from the third one
-(:mod:`benchmarks.aging_paths` makes the one of both). The settings are those
-of ``zoo_configs``, with the options of the task below. Scores are of held-out discharges of the same environments (mean error
-over the second half of each), with the constants of the model right and wrong. Training is not repeated, nor is a part of the
-evaluation.
+File and card are shipped from ``battery_env/policies/pretrained_policies``; :mod:`benchmarks.aging_paths` makes the policy for
+recorded cells. The settings are those of ``zoo_configs``, with the options of the task below. Scores are of held-out
+discharges of the same environment (mean error over the second half of each), with the constants of the model right and wrong.
+Training is not repeated, nor is a part of the evaluation.
 """
 
 from __future__ import annotations
@@ -55,32 +51,24 @@ MISMATCH = 0.2
 OPTIONS: dict[str, Any] = {"nuisance": MISMATCH, "reading_s": 2.0}
 #: And those of its training: up to 290 s between two decisions, as by default.
 TRAINED_WITH: dict[str, Any] = {**OPTIONS, "new_readings": [0, 145], "mismatch": MISMATCH, "cost": "state"}
-#: What those for recorded cells learn with besides: a model whose voltage wanders by 46 mV, in V per root of a second.
-RECORDED: dict[str, Any] = {"process_noise_V": 0.002}
 #: How wrong the constants are in the evaluation.
 MISMATCHES = (0.0, 0.1, 0.2)
 
 
-def recipe_of(env_id: str, seed: int, updates: int, recorded: bool) -> Recipe:
-    """What a policy depends on."""
-    options = TRAINED_WITH | (RECORDED if recorded else {})
-    return Recipe.of("lac", env_id, seed, updates=updates, hyperparameters={"env_kwargs": options})
-
-
-def make(env_id: str, seed: int, updates: int, recorded: bool, folder: Path) -> Recipe:
+def make(env_id: str, seed: int, updates: int, folder: Path) -> Recipe:
     """Train a policy, unless that has been done, and write it as ONNX, with the options that it needs beside it."""
-    recipe = recipe_of(env_id, seed, updates, recorded)
+    recipe = Recipe.of("lac", env_id, seed, updates=updates, hyperparameters={"env_kwargs": TRAINED_WITH})
     model = train_or_load(recipe, folder / "models")
-    file = folder / f"{file_stem(env_id, recorded)}.onnx"
+    file = folder / f"{file_stem(env_id, recorded=False)}.onnx"
     with replacing(file) as part:
         export_onnx(model, part, env_id)
     write_card(file, {"env_id": env_id, "options": OPTIONS})
     return recipe
 
 
-def part(env_id: str, recorded: bool, recipe: str, mismatch: float, sensor: str, discharges: int, folder: Path) -> Tables:
+def part(env_id: str, recipe: str, mismatch: float, sensor: str, discharges: int, folder: Path) -> Tables:
     """Score a policy."""
-    policy, options = policy_of_file(folder / f"{file_stem(env_id, recorded)}.onnx")
+    policy, options = policy_of_file(folder / f"{file_stem(env_id, recorded=False)}.onnx")
     data = standard_dataset(FOUND[env_id], "piecewise", "test", mismatch=mismatch)[:discharges]
     scores = evaluate(PolicyEstimator(policy, env_id, **options), data, SENSORS[sensor], seed=1)
     return {"pretrained": scores.assign(env_id=env_id, recipe=recipe, mismatch=mismatch, sensor=sensor)}
@@ -111,7 +99,6 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
 
 def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, minutes: float) -> dict[str, Any]:
     """What a policy says of itself."""
-    wander_V = recipe.hyperparameters["env_kwargs"].get("process_noise_V", 0.0)
     return {
         "env_id": recipe.env_id,
         "options": OPTIONS,
@@ -121,7 +108,6 @@ def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, minutes: float) 
         "training_data": (
             f"the training part of {recipe.env_id}: 700 simulated discharges whose kn, tDiffusion, to and tsn are off by "
             f"factors with a relative standard deviation of {MISMATCH:g}, 1 to 30 mV of noise and an offset within 10 mV"
-            + (f", and noise of {1e3 * wander_V:g} mV per root of a second on Vo, Vsn and Vsp" if wander_V else "")
         ),
         "training_minutes": minutes,
         "scores": scores.drop(columns="env_id").round(4).to_dict("records"),
@@ -146,19 +132,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("pretrained", __doc__, jobs=1)
     parser.add_argument("--envs", nargs="+", choices=FOUND, default=list(FOUND), metavar="ID")
-    parser.add_argument("--recorded", action="store_true", help="policies for recorded cells")
     parser.add_argument("--seed", type=natural, default=0)
     parser.add_argument("--updates", type=positive, default=5000, help="gradient steps")
     parser.add_argument("--discharges", type=at_most(HELD_OUT), default=60, help="test discharges of the evaluation")
     study = Study(parser, arguments)
     chosen = study.chosen
-    trained_with = TRAINED_WITH | (RECORDED if chosen.recorded else {})
-    study.configuration |= {"trained_with": trained_with, "options": OPTIONS}
-    recipes = {env_id: make(env_id, chosen.seed, chosen.updates, chosen.recorded, study.out) for env_id in chosen.envs}
+    study.configuration |= {"trained_with": TRAINED_WITH, "options": OPTIONS}
+    recipes = {env_id: make(env_id, chosen.seed, chosen.updates, study.out) for env_id in chosen.envs}
     parts = [
         {
             "env_id": env_id,
-            "recorded": chosen.recorded,
             "recipe": f"{recipe.digest}_{recipe.seed}",
             "mismatch": mismatch,
             "sensor": sensor,
@@ -171,8 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scores = study.run(part, parts, folder=study.out)["pretrained"]
     table = summary(scores)
     for env_id, recipe in recipes.items():
-        own, stem = table[table["env_id"] == env_id], file_stem(env_id, chosen.recorded)
-        file = study.out / f"{stem}.onnx"
+        own, file = table[table["env_id"] == env_id], study.out / f"{file_stem(env_id, recorded=False)}.onnx"
         write_card(file, card_of(recipe, own, study.command, training_minutes(recipe, study.out / "models")))
     study.write({"pretrained": scores, "pretrained_summary": table}, {}, shown(table))
 

@@ -1,7 +1,6 @@
 """
-Updates a second of LAC, compiled and not, beside SAC of Stable-Baselines3 and of SBX (JAX), and what a GPU is worth; how many
-steps a second the battery model and the environments make, and how long an update of a filter and of a policy takes, beside
-NASA's progpy.
+Updates a second of LAC, compiled and not, beside SAC of Stable-Baselines3 and of SBX (JAX), and what a GPU is worth; how long
+an update of a filter and of a policy takes, beside NASA's progpy.
 
 .. code-block:: bash
 
@@ -29,20 +28,17 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import torch as th
-from matplotlib import rc_context
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import trange
 
 from battery_env import ExtendedKalmanFilter, OnnxPolicy, PolicyEstimator
-from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, step_into, voltage_into
+from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.records import Stream
 from benchmarks.study import Study, command_line, markdown, positive
 from sb3_lac import LAC, GymnasiumVecEnv, PublishedLAC
-
-SECTIONS = ("updates", "model", "environments", "filters", "gpu")
 
 _ENV = "BatteryQmax-v0"
 _POLICY_ENV = "BatteryVoltageJoint-v0"
@@ -52,15 +48,8 @@ _UPDATES = (([64, 64], 1, 50), ([64, 64], 50, 1), ([256, 256], 1, 10))
 # hidden layers, batch size, updates in a call on the GPU and on a core, where large networks take seconds for each
 _ON_GPU = (([64, 64], 256, 50, 50), ([256, 256, 256], 256, 50, 10), ([1024, 1024, 1024], 4096, 10, 1))
 _GPU = "cuda" if th.cuda.is_available() else ""
-# of one turn
-_SIMULATED_STEPS = 1500
-_SIMULATIONS = 20
-_BATCHED_STEPS = 100
-_ENV_STEPS = 512
 # samples, 1 s apart, of a turn of those that take microseconds and milliseconds each
 _SAMPLES, _PROGPY_SAMPLES, _PARTICLES_SAMPLES = 600, 20, 4
-# and how often all cells of each decide in one turn: whole episodes
-_ENVIRONMENTS = {"BatteryQmax-v0": 128, "BatteryVoltageJoint-v0": 8}
 
 
 def race(contestants: dict[str, Callable[[], int]], rounds: int, clock: Callable[[], float]) -> pd.DataFrame:
@@ -167,93 +156,6 @@ def measure_gpu(rounds: int) -> tuple[pd.DataFrame, str]:
     return pd.concat(tables).assign(GPU=th.cuda.get_device_name()), markdown(rows)
 
 
-def model_contestants(cells: int) -> dict[str, Callable[[], int]]:
-    """
-    The thermal model under a current of 2 A, from full charge, here and in progpy: one cell, and many at once. Under current
-    the step itself needs no voltage, under power, which progpy does not take, it does.
-    """
-    with rc_context():  # progpy changes the defaults of matplotlib
-        from progpy.models import BatteryElectroChemEOD  # heavy, and needed here only
-
-    peer = BatteryElectroChemEOD()
-    load = peer.InputContainer({"i": 2.0})
-    load_of_all = peer.InputContainer({"i": np.full(cells, 2.0)})
-    full = {name: float(np.ravel(value)[0]) for name, value in peer.initialize().items()}
-
-    def simulated() -> int:
-        for _ in range(_SIMULATIONS):
-            simulate(2.0, NEW_CELL.q_mobile, NEW_CELL.r_o, _SIMULATED_STEPS, load_unit="current", thermal=True)
-        return _SIMULATIONS * _SIMULATED_STEPS
-
-    def peer_simulated() -> int:
-        peer.simulate_to(_SIMULATED_STEPS, lambda t, x=None: load, dt=1.0, save_freq=1.0)
-        return _SIMULATED_STEPS
-
-    def peer_stepped() -> int:
-        state = peer.initialize()
-        for _ in range(_SIMULATED_STEPS):
-            state = peer.next_state(state, load, 1.0)
-            peer.output(state)
-        return _SIMULATED_STEPS
-
-    def batched(load_unit: Any, amount: float, with_voltage: bool) -> int:
-        q_mobile, r_o = np.full(cells, NEW_CELL.q_mobile), np.full(cells, NEW_CELL.r_o)
-        state, loads, volts = initial_state(q_mobile), np.full(cells, amount), np.empty(cells)
-        for _ in range(_BATCHED_STEPS):
-            step_into(state, state, loads, q_mobile, r_o, 1.0, load_unit, True, NEW_CELL.packed)
-            if with_voltage:
-                voltage_into(volts, state, q_mobile, NEW_CELL.packed)
-        return _BATCHED_STEPS * cells
-
-    def peer_batched(with_voltage: bool) -> int:
-        state = peer.StateContainer({name: np.full(cells, value) for name, value in full.items()})
-        for _ in range(_BATCHED_STEPS):
-            state = peer.next_state(state, load_of_all, 1.0)
-            if with_voltage:
-                peer.output(state)
-        return _BATCHED_STEPS * cells
-
-    return {
-        "1 cell, step and voltage: simulate()": simulated,
-        "1 cell, step and voltage: progpy simulate_to()": peer_simulated,
-        "1 cell, step and voltage: progpy next_state(), output()": peer_stepped,
-        f"{cells} cells, step and voltage: step_into(), voltage_into()": partial(batched, "current", 2.0, True),
-        f"{cells} cells, step and voltage: progpy next_state(), output()": partial(peer_batched, True),
-        f"{cells} cells, step: step_into()": partial(batched, "current", 2.0, False),
-        f"{cells} cells, step: progpy next_state()": partial(peer_batched, False),
-        f"{cells} cells, step under power: step_into()": partial(batched, "power", 8.0, False),
-    }
-
-
-def environment_contestants(cells: int) -> dict[str, Callable[[], int]]:
-    """The environments for one cell and for many, with all that belongs to a step: observation, reward, info, new episodes."""
-    contestants: dict[str, Callable[[], int]] = {}
-
-    def turn_of_one(env: gym.Env[Any, Any], actions: Any) -> int:
-        for n in range(_ENV_STEPS):
-            if env.step(actions[n % len(actions)])[3]:
-                env.reset()
-        return _ENV_STEPS
-
-    def turn_of_many(env: gym.vector.VectorEnv[Any, Any, Any], actions: Any, steps: int) -> int:
-        for n in range(steps):
-            env.step(actions[n % len(actions)])
-        return steps * cells
-
-    for env_id, steps in _ENVIRONMENTS.items():
-        one = gym.make(env_id, disable_env_checker=True)
-        one.reset(seed=0)
-        one.action_space.seed(0)
-        contestants[f"{env_id}, 1 cell"] = partial(turn_of_one, one, [one.action_space.sample() for _ in range(64)])
-        for mode in ("NextStep", "SameStep"):
-            many = gym.make_vec(env_id, num_envs=cells, autoreset_mode=mode)
-            many.reset(seed=0)
-            many.action_space.seed(0)
-            actions = [many.action_space.sample() for _ in range(64)]
-            contestants[f"{env_id}, {cells} cells, {mode}"] = partial(turn_of_many, many, actions, steps)
-    return contestants
-
-
 def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
     """
     Calibrators that follow a stream of one sample a second, here and in progpy: both parameters unknown here, and ``q_mobile``
@@ -292,6 +194,13 @@ def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
     }
 
 
+def measure_filters(rounds: int) -> tuple[pd.DataFrame, str]:
+    """How long an update of those takes."""
+    with TemporaryDirectory() as folder:
+        speeds = race(filter_contestants(Path(folder)), rounds, time.process_time)
+    return speeds, report_filters(speeds)
+
+
 def report_filters(speeds: pd.DataFrame) -> str:
     """What was measured of filters, as Markdown."""
     rows = []
@@ -315,49 +224,23 @@ def spread(values: pd.Series, digits: int) -> str:
     return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
-def report_steps(speeds: pd.DataFrame) -> str:
-    """
-    What was measured of steps, as Markdown. Where progpy does the same work, the ratio is to the contestant of this package.
-    """
-    rows = []
-    for name, values in speeds.items():
-        work, _, who = str(name).partition(": ")
-        own = next(column for column in speeds if str(column).partition(": ")[0] == work)
-        faster = spread(speeds[own] / values, 0) if who.startswith("progpy") else ""
-        thousands = spread(values / 1000.0, 1)
-        row = {"": name, "thousand steps per second of one core, median (quartiles)": thousands}
-        rows.append({**row, "battery_env is faster by a factor of": faster})
-    table = pd.DataFrame(rows)
-    return markdown(table if table.iloc[:, 2].any() else table.iloc[:, :2])
+#: What can be measured.
+SECTIONS = {"updates": measure_updates, "filters": measure_filters, "gpu": measure_gpu}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("speed", __doc__, jobs=None)
-    parser.add_argument(
-        "--only", nargs="+", choices=SECTIONS, default=list(SECTIONS if _GPU else SECTIONS[:-1]), help="what to measure"
-    )
+    here = [section for section in SECTIONS if section != "gpu" or _GPU]
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=here, help="what to measure")
     parser.add_argument("--rounds", type=positive, default=20, help="turns of each contestant")
-    parser.add_argument("--cells", type=positive, default=1024, help="cells of a batch of the model and of an environment")
     study = Study(parser, arguments)
     chosen = study.chosen
     if "gpu" in chosen.only and not _GPU:
         parser.error("gpu needs an NVIDIA GPU that torch can use: torch.cuda.is_available() is False")
-    measures = {"updates": measure_updates, "gpu": measure_gpu}
-    with TemporaryDirectory() as folder:
-        raced = {
-            "model": (partial(model_contestants, chosen.cells), report_steps),
-            "environments": (partial(environment_contestants, chosen.cells), report_steps),
-            "filters": (partial(filter_contestants, Path(folder)), report_filters),
-        }
-        for section in chosen.only:
-            if section in measures:
-                speeds, text = measures[section](chosen.rounds)
-            else:
-                contestants, report = raced[section]
-                speeds = race(contestants(), chosen.rounds, time.process_time)
-                text = report(speeds)
-            study.write({section: speeds}, {}, text, section)
+    for section in chosen.only:
+        speeds, text = SECTIONS[section](chosen.rounds)
+        study.write({section: speeds}, {}, text, section)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ import torch as th
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 
 from battery_env import ClosedForm, evaluate
 from benchmarks import compare, contests
@@ -90,7 +89,10 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     assert not list(out.rglob("checkpoint*"))
 
     for log in (out / "tensorboard" / ENV_ID).iterdir():
-        shows_in_tensorboard(log, lyapunov=log.name.startswith("LAC"))
+        tags = EventAccumulator(str(log)).Reload().Tags()
+        of_lac = {"lyapunov/report"} if log.name.startswith("LAC") else set()
+        assert set(tags["images"]) == {"calibration/r_o_inferred"} | of_lac
+        assert "custom_scalars__config__" in tags["tensors"] and "eval/mean_reward" in tags["scalars"]
 
     record = json.loads((out / "compare.json").read_text())
     made_by = record["configuration"]["recipes"][recipe("sac").digest]
@@ -98,25 +100,6 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     assert made_by["hyperparameters"]["batch_size"] == 16 and made_by["arguments"]["tau"] == 0.005
     (run,) = made_by["runs"]
     assert (run["seed"], run["resumed"]) == (0, 0) and {"torch", "sb3_lac"} <= set(run["versions"])
-
-
-def shows_in_tensorboard(log, lyapunov):
-    """Assert that a run has the charts, and data for those of its algorithm."""
-    events = EventAccumulator(str(log))
-    events.Reload()
-    tags = events.Tags()
-    (layout,) = events.Tensors("custom_scalars__config__")
-    charts = {
-        chart.title: list(chart.multiline.tag) or [chart.margin.series[0].value]
-        for category in Layout.FromString(layout.tensor_proto.string_val[0]).category
-        for chart in category.chart
-    }
-    assert next(iter(charts)) == "MAPE (%)"
-    shown = {title for title, (tag,) in charts.items() if any(re.match(tag, scalar) for scalar in tags["scalars"])}
-    assert {"MAPE (%)", "MAPE of the worst discharge (%)", "return of an evaluation", "cost per step of the training"} <= shown
-    assert ({"lambda", "decrease along roll-outs"} <= shown) == lyapunov
-    assert set(tags["images"]) == {"calibration/r_o_inferred"} | ({"lyapunov/report"} if lyapunov else set())
-    assert "_hparams_/session_start_info" in tags["tensors"] or events.SummaryMetadata("_hparams_/session_start_info")
 
 
 @pytest.fixture
@@ -331,11 +314,3 @@ def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatc
     with pytest.raises(ZeroDivisionError):
         compare.main(command("--algos", "sac", "td3"))
     assert list(pd.read_csv(tmp_path / "out" / "compare.csv")["algo"]) == ["td3", "closed form"]
-
-    def fails(study):
-        raise ValueError("no tables")
-
-    monkeypatch.setattr(compare, "report", fails)
-    with pytest.raises(ZeroDivisionError):
-        compare.main(command("--algos", "sac", "td3"))
-    assert "the tables of what finished failed: ValueError('no tables')" in capsys.readouterr().err

@@ -1,9 +1,7 @@
 """Contestants take turns and do the same work, and sections are written."""
 
 import itertools
-import json
 
-import numpy as np
 import pandas as pd
 import pytest
 import torch as th
@@ -16,9 +14,6 @@ from sb3_lac import compiled
 def small(monkeypatch):
     """Few transitions, short turns and small networks, and the threads of torch as they were."""
     threads = th.get_num_threads()
-    for name in ("_SIMULATED_STEPS", "_SIMULATIONS", "_BATCHED_STEPS", "_ENV_STEPS"):
-        monkeypatch.setattr(speed, name, 3)
-    monkeypatch.setattr(speed, "_ENVIRONMENTS", {"BatteryRo-v0": 3})
     for name, value in {"_TRANSITIONS": 32, "_UPDATES": (([8], 2, 1),), "_ON_GPU": (([8], 8, 2, 1),)}.items():
         monkeypatch.setattr(speed, name, value)
     monkeypatch.setattr(compiled, "BACKEND", "eager")
@@ -45,56 +40,13 @@ def test_contestants_take_turns_in_alternating_order():
     pd.testing.assert_frame_equal(speeds, pd.DataFrame({"LAC": [4.0] * 4, "SAC": [2.0] * 4, "TD3": [8.0] * 4}))
 
 
-def test_the_model_does_the_same_work_as_progpy(monkeypatch):
-    models = pytest.importorskip("progpy.models")
-    final = {}
-    for name, original in (("step_into", speed.step_into), ("voltage_into", speed.voltage_into)):
-
-        def recorded(out, *arguments, name=name, original=original):
-            original(out, *arguments)
-            final[name] = out.copy()
-
-        monkeypatch.setattr(speed, name, recorded)
-    output = models.BatteryElectroChemEOD.output
-    monkeypatch.setattr(
-        models.BatteryElectroChemEOD, "output", lambda self, x: final.update(progpy=(x, output(self, x))) or output(self, x)
-    )
-    contestants = speed.model_contestants(2)
-    assert [turn() for turn in contestants.values()] == [9, 3, 3, 6, 6, 6, 6, 6]
-    for name, turn in contestants.items():
-        if name.startswith("2 cells, step and voltage"):
-            turn()
-    state, outputs = final["progpy"]
-    np.testing.assert_allclose(final["voltage_into"], outputs["v"], rtol=1e-9)
-    np.testing.assert_allclose(final["step_into"][:, 0], state["tb"], rtol=1e-9)
-
-
-def test_steps_are_compared_with_those_of_the_same_work_within_each_round():
-    # the machine is half as fast in the second round: the ratio does not care
-    speeds = pd.DataFrame({"a: ours": [8e3, 4e3], "a: progpy x": [2e3, 1e3], "b: ours": [9e3, 9e3], "b: progpy y": [3e3, 1e3]})
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in speed.report_steps(speeds).splitlines()]
-    assert rows[2:] == [
-        ["a: ours", "6.0 (5.0 to 7.0)", ""],
-        ["a: progpy x", "1.5 (1.2 to 1.8)", "4 (4 to 4)"],
-        ["b: ours", "9.0 (9.0 to 9.0)", ""],
-        ["b: progpy y", "2.0 (1.5 to 2.5)", "6 (4 to 8)"],
-    ]
-    assert "faster" not in speed.report_steps(speeds[["a: ours"]])
-
-
-def test_environments_and_filters_are_raced_and_written(monkeypatch, tmp_path, capsys):
+def test_filters_are_raced_and_written(monkeypatch, tmp_path, capsys):
     pytest.importorskip("progpy")
     pytest.importorskip("onnxruntime")
-    contestants = speed.environment_contestants(4)
-    expected = {"BatteryRo-v0, 1 cell": 3, "BatteryRo-v0, 4 cells, NextStep": 12, "BatteryRo-v0, 4 cells, SameStep": 12}
-    assert {name: turn() for name, turn in contestants.items()} == expected
     for name, count in (("_SAMPLES", 130), ("_PROGPY_SAMPLES", 2), ("_PARTICLES_SAMPLES", 2)):
         monkeypatch.setattr(speed, name, count)
-    short = ["--only", "environments", "filters", "--rounds", "2", "--cells", "4"]
-    speed.main([*short, "--out", str(tmp_path)])
-    for section in ("environments", "filters"):
-        assert (pd.read_csv(tmp_path / f"{section}.csv") > 0).all(axis=None)
-        assert json.loads((tmp_path / f"{section}.json").read_text())["configuration"]["cells"] == 4
+    speed.main(["--only", "filters", "--rounds", "2", "--out", str(tmp_path)])
+    assert (pd.read_csv(tmp_path / "filters.csv") > 0).all(axis=None)
     shown = capsys.readouterr().out
     assert "| progpy, unscented Kalman filter" in shown and "1.00 (1.00 to 1.00)" in shown
 
