@@ -104,13 +104,8 @@ class Reason(IntEnum):
     )
     NOT_FOLLOWED = "The current changes by {size:.2f} A at {fault_s:.0f} s, and the voltage does not follow."
     RISES = "The voltage rises by {size:.2f} V at {fault_s:.0f} s, where the current stays as it was."
-    NOT_DRAWN = (
-        "No sample lies between {since_s:.0f} s and {fault_s:.0f} s, and the voltage does not fall by what the {size:.0f} C "
-        "of that time would make it: the clock jumped, or the load was off. Correct the times, or give the rest as samples of "
-        "no current."
-    )
     MISSED = (
-        "Between {since_s:.0f} s and {fault_s:.0f} s the voltage steps by what {size:.0f} C make: rows are missing together "
+        "Between two samples under a steady load the voltage steps by what {missed_C:.0f} C make: rows are missing together "
         "with their time, or a charge is, that flowed and was not measured. Export all rows, with the clock of the tester."
     )
     # what was given does not suffice
@@ -172,17 +167,13 @@ class Reason(IntEnum):
         "missing: {uncounted_C:.0f} C are in doubt. Check units and clock, and export the time since the start of the test.",
         "q_mobile",
     )
-    MISSED_UNSURE = (
-        "The voltage steps between two samples by what {missed_C:.0f} C make, under a steady load: so many are in doubt.",
-        "q_mobile",
-    )
     Q_DROPPED = _DROPPED.format("{dropped_C:.0f} C are"), "q_mobile"
     R_DROPPED = _DROPPED.format("{dropped_mohm:.0f} mohm of R_o are"), "r_o"
     Q_SWITCHES = _SWITCHES.format("{switched_C:.0f} C are in doubt", ", or the charge that the tester counts"), "q_mobile"
     R_SWITCHES = _SWITCHES.format("R_o does not show", ""), "r_o"
-    GAP_UNSURE = (
-        "No sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not tell whether the load was "
-        "on: {gap_C:.0f} C are in doubt.",
+    GAP = (
+        "No sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not show that the load was "
+        "on: {gap_C:.0f} C are in doubt. Correct the times if the clock jumped, or give a rest as samples of no current.",
         "q_mobile",
     )
     Q_PRIOR_ALONE = _PRIOR_ALONE.format("q_max", _IMPRECISE_Q), "q_mobile"

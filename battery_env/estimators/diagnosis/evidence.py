@@ -6,7 +6,7 @@ its current. A stream is watched sample by sample, and a whole record in the sam
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import expm1, hypot, inf, isnan, nan, sqrt
+from math import expm1, hypot, isnan, nan, sqrt
 from typing import Any
 
 import numpy as np
@@ -49,9 +49,21 @@ _LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
 _RECOVERY_SHARE = 0.2
 # A change of the voltage is compared with so many before and behind it.
 _BESIDE = 5
-# What dropouts of the current, or switches between samples, make of the charge speaks against both numbers where an estimate
-# of it would not be settled.
+# Switches between samples that leave more of the charge open than a settled estimate may tell no resistance.
 _MOST_SHARE = SETTLED_SHARES["q_mobile"]
+# What is said of a charge that nobody saw.
+_DOUBTS = np.array(
+    [
+        Reason.LOAD_ON_UNSURE,
+        Reason.REST_CURRENT,
+        Reason.TAPERED_EARLY,
+        Reason.UNCOUNTED,
+        Reason.MISSED,
+        Reason.Q_DROPPED,
+        Reason.Q_SWITCHES,
+        Reason.GAP,
+    ]
+)
 # Voltages are kept about this far apart, s: all that are kept cover the window in which a voltage may not rise.
 _KEPT_EVERY_S = 0.9
 
@@ -94,7 +106,7 @@ _RING = table(
 )
 
 # The first fault that was found, 0 if there is none: when, and how large it is.
-_FAULT = table([("reason", "i8"), *((name, "f8") for name in ("time_s", "since_s", "size"))])
+_FAULT = table([("reason", "i8"), ("time_s", "f8"), ("size", "f8")])
 
 #: What the samples of a discharge have shown so far.
 EVIDENCE = table(
@@ -204,7 +216,6 @@ def measured(evidence: Any, initial_soc: float, clock_s: float = 0.0, charge: Ch
         "offset_A": rest["mean_A"],
         "offset_C": abs(rest["mean_A"]) * (evidence["time_s"] - rest["over_s"]),
         "fault_s": clock_s + (fault["time_s"] if fault["reason"] else switch["time_s"]),
-        "since_s": clock_s + fault["since_s"],
         "size": fault["size"] if fault["reason"] else switch["size_A"],
         "switched_C": float(switched_C(evidence["switches"])),
         "switches": evidence["switches"]["count"],
@@ -267,7 +278,7 @@ def examine(evidence: Row, voltage: float, current: float, q_mobile: float, r_o:
         middle_V = middle(before.voltage_2_V, before.voltage_1_V, voltage)
         resistance_ohm = _least_resistance_ohm(evidence.start, q_mobile, r_o)
         _examine_last(evidence, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile), r_o)
-        _look_for_missed(evidence, current, q_mobile)
+        _look_for_missed(evidence, current)
         switch = evidence.switch
         lowest_V, highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
         is_pending = switch.size_A != 0.0 and evidence.fault.reason == 0
@@ -314,13 +325,28 @@ def _rest_current_C(evidence: Row) -> float:
 
 
 @compiled
+def _doubts_C(evidence: Row) -> tuple[float, ...]:
+    # the standard deviations of the charge by all that nobody saw, in the order of _DOUBTS
+    rest = evidence.rest
+    return (
+        rest.load_on_C if rest.is_over else 0.0,
+        _rest_current_C(evidence),
+        evidence.left_C,
+        evidence.uncounted_C,
+        evidence.missed_C,
+        evidence.dropped_C,
+        0.0 if evidence.is_counted else switched_C(evidence.switches),
+        gaps.doubtful_C(evidence),
+    )
+
+
+@compiled
 def unseen_C(evidence: Row) -> float:
     """The standard deviation of the charge by all that nobody saw."""
-    rest = evidence.rest
-    beside_C = hypot(rest.load_on_C if rest.is_over else 0.0, _rest_current_C(evidence))
-    between_C = hypot(gaps.doubtful_C(evidence), 0.0 if evidence.is_counted else switched_C(evidence.switches))
-    missed_C = hypot(evidence.missed_C, evidence.dropped_C)
-    return hypot(hypot(hypot(beside_C, evidence.uncounted_C), hypot(between_C, missed_C)), evidence.left_C)
+    variance_C2 = 0.0
+    for doubt_C in _doubts_C(evidence):
+        variance_C2 += doubt_C**2
+    return sqrt(variance_C2)
 
 
 @compiled
@@ -332,22 +358,12 @@ def is_smeared(evidence: Row) -> bool:
 @compiled
 def doubt_reason(evidence: Row, sd_C: float) -> int:
     """Say which charge that nobody saw makes most of a standard deviation of ``q_mobile``; 0 if none does."""
-    rest, most_C = evidence.rest, MOST_OF_SD * sd_C
-    if rest.is_over and rest.load_on_C > most_C:
-        return Reason.LOAD_ON_UNSURE + 0
-    if _rest_current_C(evidence) > most_C:
-        return Reason.REST_CURRENT + 0
-    if evidence.left_C > most_C:
-        return Reason.TAPERED_EARLY + 0
-    if evidence.uncounted_C > most_C:
-        return Reason.UNCOUNTED + 0
-    if evidence.missed_C > most_C:
-        return Reason.MISSED_UNSURE + 0
-    if evidence.dropped_C > most_C:
-        return Reason.Q_DROPPED + 0
-    if not evidence.is_counted and switched_C(evidence.switches) > most_C:
-        return Reason.Q_SWITCHES + 0
-    return Reason.GAP_UNSURE + 0 if sd_C < inf and gaps.doubtful_C(evidence) > 0.0 else 0
+    number = 0
+    for doubt_C in _doubts_C(evidence):
+        if doubt_C > MOST_OF_SD * sd_C:
+            return int(_DOUBTS[number])
+        number += 1
+    return 0
 
 
 @compiled
@@ -416,7 +432,7 @@ def _is_followed(evidence: Row, time_s: float, lowest_V: float, highest_V: float
 
 
 @compiled
-def _take_back(evidence: Row, current: float, most_q: float, r_o: float) -> bool:
+def _take_back(evidence: Row, current: float, r_o: float) -> bool:
     # A switch that the voltage did not follow, and that was taken back, was none: what it made of the charge is in doubt
     switch, last = evidence.switch, evidence.examined
     switched_A = current - last.current_A
@@ -424,14 +440,12 @@ def _take_back(evidence: Row, current: float, most_q: float, r_o: float) -> bool
         return False
     evidence.dropped_C += abs(switch.charge_C)
     evidence.dropped_ohm += abs(r_o - switch.before_ohm)
-    if evidence.dropped_C > _MOST_SHARE * most_q:
-        find(evidence, Reason.NOT_FOLLOWED, switch.time_s, 0.0, current - last.current_A)
     last.lagging_A, switch.size_A, switch.back_s = current, 0.0, evidence.time_s
     return True
 
 
 @compiled
-def _note_switch(evidence: Row, time_s: float, current: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
+def _note_switch(evidence: Row, time_s: float, current: float, resistance_ohm: float, r_o: float) -> None:
     # whether the load jumped, or was switched, since the last sample that was examined
     switch, last = evidence.switch, evidence.examined
     last.largest_A = max(last.largest_A, abs(current))
@@ -453,7 +467,7 @@ def _note_switch(evidence: Row, time_s: float, current: float, resistance_ohm: f
             switch.lowest_V = switch.highest_V = evidence.before.voltage_1_V
         # steps the same way before it was judged are one switch: a mean over an interval shows a switch as two
         switch.size_A += switched_A
-        if _take_back(evidence, current, most_q, r_o):
+        if _take_back(evidence, current, r_o):
             return
         # the ohmic drop must follow little after a pulse too short for it to build up
         switch.to_follow_A = max(min(current - last.lagging_A, max(switch.size_A, 0.0)), min(switch.size_A, 0.0))
@@ -472,7 +486,7 @@ def _look_for_rise(evidence: Row, time_s: float, voltage: float, current: float)
             rise_V = voltage - ring.voltage_V[n] - _MOST_RESISTANCE_OHM * max(ring.current_A[n] - current, 0.0)
             was_steady = time_s - since_s - evidence.examined.jump_s >= STEADY_S
             if was_steady and rise_V > _RISE_V and rise_V > noise_V(evidence):
-                find(evidence, Reason.RISES, time_s - since_s, 0.0, rise_V)
+                find(evidence, Reason.RISES, time_s - since_s, rise_V)
             break
     if ring.n_kept == 0 or time_s - ring.time_s[(ring.n_kept - 1) % KEPT] >= _KEPT_EVERY_S:
         n = ring.n_kept % KEPT
@@ -481,7 +495,7 @@ def _look_for_rise(evidence: Row, time_s: float, voltage: float, current: float)
 
 
 @compiled
-def _look_for_missed(evidence: Row, current: float, q_mobile: float) -> None:
+def _look_for_missed(evidence: Row, current: float) -> None:
     # Under a steady load the voltage changes from sample to sample as it did before and does afterwards, or in proportion to
     # the time between them. A step beyond that and noise is a charge that rows were lost with, together with their time.
     ring, count = evidence.ring, 2 * _BESIDE + 1
@@ -509,11 +523,7 @@ def _look_for_missed(evidence: Row, current: float, q_mobile: float) -> None:
     if abs(step_V) <= noise_of_change_V:
         return
     fall_V_per_s = max(-float(change_V.sum() - alone_V) / (span_s - interval_s[_BESIDE]), RESOLUTION_V / span_s)
-    missed_C = current * step_V / fall_V_per_s
-    evidence.missed_C = hypot(evidence.missed_C, missed_C)
-    if evidence.missed_C > _MOST_SHARE * q_mobile:
-        step_s = evidence.time_s - interval_s[_BESIDE + 1 :].sum()
-        find(evidence, Reason.MISSED, step_s, step_s - interval_s[_BESIDE], evidence.missed_C)
+    evidence.missed_C = hypot(evidence.missed_C, current * step_V / fall_V_per_s)
 
 
 @compiled
@@ -524,10 +534,10 @@ def _examine_last(evidence: Row, voltage: float, resistance_ohm: float, most_q: 
     if switch.size_A != 0.0:
         # some loggers write a voltage a sample later than its current: the first one after a switch may belong before it
         switch.lowest_V, switch.highest_V = min(switch.lowest_V, before.voltage_1_V), max(switch.highest_V, before.voltage_1_V)
-    _note_switch(evidence, time_s, current, resistance_ohm, most_q, r_o)
+    _note_switch(evidence, time_s, current, resistance_ohm, r_o)
     if switch.size_A != 0.0 and time_s - switch.time_s > _START_WINDOW_S:
         if not _is_followed(evidence, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
-            find(evidence, Reason.NOT_FOLLOWED, switch.time_s, 0.0, switch.size_A)
+            find(evidence, Reason.NOT_FOLLOWED, switch.time_s, switch.size_A)
         switch.size_A = 0.0
     _look_for_rise(evidence, time_s, voltage, current)
     # under a steady load the voltage at rest is higher by the ohmic drop at least; a charge that is seen raises it
@@ -539,7 +549,7 @@ def _examine_last(evidence: Row, voltage: float, resistance_ohm: float, most_q: 
         # on a flat curve, or with a smaller drop than that, it never was much lower
         is_high = voltage + drop_V > max(evidence.low_V, evidence.share_V + _RISE_V)
         if is_high and min(current, last.lagging_A) >= -REST_CURRENT_A:
-            find(evidence, Reason.RECOVERED, time_s, 0.0, evidence.drawn_C)
+            find(evidence, Reason.RECOVERED, time_s, evidence.drawn_C)
     last.count += 1
     last.earlier_V = voltage if last.count == 1 else last.voltage_V
     last.time_s, last.voltage_V, last.current_A = time_s, voltage, current

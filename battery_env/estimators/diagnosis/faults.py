@@ -48,8 +48,8 @@ def noise_V(evidence: Row) -> float:
 
 
 @compiled
-def find(evidence: Row, reason: int, time_s: float, since_s: float, size: float) -> None:
+def find(evidence: Row, reason: int, time_s: float, size: float) -> None:
     """Note a fault; the first one is kept."""
     fault = evidence.fault
     if fault.reason == 0:
-        fault.reason, fault.time_s, fault.since_s, fault.size = reason, time_s, since_s, size
+        fault.reason, fault.time_s, fault.size = reason, time_s, size

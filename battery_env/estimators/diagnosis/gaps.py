@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from math import expm1, hypot, isnan
+from math import expm1, isnan
 
 from battery_env.compiled import compiled
-from battery_env.estimators.diagnosis.faults import NOISES, RESOLUTION_V, SMOOTHED_SHARE, Row, find, middle, noise_V, table
-from battery_env.estimators.reasons import Reason
+from battery_env.estimators.diagnosis.faults import NOISES, SMOOTHED_SHARE, Row, middle, noise_V, table
 from battery_env.records import REST_CURRENT_A, STEADY_S, SWITCH_SHARE
 
 # An interval between two samples is a gap where it is so many times longer than the one before, and what its load draws in
@@ -15,7 +14,7 @@ from battery_env.records import REST_CURRENT_A, STEADY_S, SWITCH_SHARE
 _RATIO, _LEAST_SHARE, _HABIT = 2.5, 0.005, 3
 # Where the charge of a gap was drawn, cell and model part across it by less than this share of the fall of the model.
 _MOST_SHARE = 0.5
-# With so many standard deviations to spare it is a verdict.
+# With so many standard deviations to spare it was.
 _SURE_SD = 1.5
 # What model and cell part by is averaged over about so many samples before a gap, twice, which tells its trend, and how fast
 # the voltage falls over so long, s; after it the middle voltage of three counts.
@@ -130,5 +129,3 @@ def _close(evidence: Row, voltage: float, load_A: float) -> None:
         _note_interval(evidence, gap.length_s, load_A)
         return
     _doubt(gap)
-    if gap.fall_V > 0.0 and missing_V - _SURE_SD * hypot(sd_V, RESOLUTION_V) > most_V:
-        find(evidence, Reason.NOT_DRAWN + 0, gap.end_s, gap.end_s - gap.length_s, gap.charge_C)
