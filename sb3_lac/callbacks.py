@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 class LyapunovCallback(EventCallback):
     """
     Callback for evaluating the learned Lyapunov function along roll-outs of the mean action (see ``evaluate_lyapunov()``).
-    The training is not changed by it. TensorBoard also gets the figure of each report (``lyapunov/report``).
+    The training is not changed by it. TensorBoard also gets the figure of each report, CSV and JSON the limits of intervals.
 
     .. warning::
 
@@ -111,10 +111,10 @@ class LyapunovCallback(EventCallback):
         return self._on_event()
 
     def _log(self, values: dict[str, float]) -> None:
-        """Log values, whose intervals are in the history, and in TensorBoard their figures."""
+        """Log values; the limits of their intervals in CSV and JSON files alone, and figures in TensorBoard."""
         for name, value in values.items():
-            if not name.endswith(("_low", "_high")):
-                self.logger.record(f"{self.FOLDER}/{name}", value)
+            is_limit = name.endswith(("_low", "_high"))
+            self.logger.record(f"{self.FOLDER}/{name}", value, exclude=("stdout", "log", "tensorboard") if is_limit else None)
         if tensorboard_writer(self.logger) is not None:
             for name, figure in self._figures().items():
                 self.logger.record(f"{self.FOLDER}/{name}", Figure(figure, close=False), exclude=NOT_TENSORBOARD)

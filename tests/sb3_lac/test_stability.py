@@ -17,6 +17,7 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_lac import LAC, CertificateCallback, LyapunovCallback, certify, evaluate_lyapunov
@@ -400,7 +401,7 @@ def test_figures(make_exact_model):
 # Callback
 
 
-def test_callback_logs_the_metrics(make_model, make_env, capsys):
+def test_callback_logs_the_metrics(make_model, make_env, tmp_path, capsys):
     reports, logged = [], []
 
     class AfterEval(BaseCallback):
@@ -409,6 +410,7 @@ def test_callback_logs_the_metrics(make_model, make_env, capsys):
             return len(reports) < 3
 
     model = make_model(n_collect=0, gamma=0.8)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
     dump = model.logger.dump
     model.logger.dump = lambda step: (logged.append(dict(model.logger.name_to_value)), dump(step))
     callback = LyapunovCallback(make_env(), AfterEval(), n_eval_episodes=3, eval_freq=10, seed=4)
@@ -420,10 +422,12 @@ def test_callback_logs_the_metrics(make_model, make_env, capsys):
     # SB3 cuts names after 36 characters
     assert logged[1]["lyapunov/feasible_alpha3"] == feasible.value and all(len(name) <= 36 for name in logged[1])
     assert callback.history[1]["timesteps"] == 20 and callback.history[1]["feasible_alpha3_low"] == feasible.low
+    assert pd.read_csv(tmp_path / "progress.csv")["lyapunov/feasible_alpha3_low"].dropna().iloc[1] == feasible.low
     # A training that is continued from a checkpoint, until the next callback stops it
     model.num_timesteps = 12
     assert model.learn(200, callback=callback, reset_num_timesteps=False).num_timesteps == 17
     # What was evaluated after the checkpoint was of a model that is gone
+    model.logger.close()
     assert [entry["timesteps"] for entry in callback.history] == [10, 17]
     # Another training is not mixed with it
     make_model(n_collect=0).learn(5, callback=callback)
