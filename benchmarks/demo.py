@@ -40,7 +40,7 @@ def followed(out: Path) -> str:
     """Calibrate to all discharges of a real cell, and say how it aged."""
     with contextlib.redirect_stdout(io.StringIO()):
         calibrate([CELL, "--table-only", "--jobs", "2", "--force", "--out", str(out)])
-    life = pd.read_csv(out / f"{CELL}_estimate.csv").iloc[[0, -1]]
+    life = pd.read_csv(out / "estimate.csv").iloc[[0, -1]]
     q_max = " -> ".join(f"{q_mobile_C / 3600.0:.3f}" for q_mobile_C in life["q_mobile_C"])
     r_o = " -> ".join(f"{1e3 * r_o_ohm:.0f}" for r_o_ohm in life["r_o_ohm"])
     return f"real cell {CELL} over {life['cycle'].iloc[1]} discharges: q_max {q_max} Ah, R_o {r_o} mohm"
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"\n2/2  battery-calibrate {CELL} --out {life}: all discharges of a real cell\n", flush=True)
     aged = followed(life)
     print(f"Found:    {errors}; {aged}")
-    print(f"Pictures: {trained / f'{ENV}_inferred.png'}, {trained / f'{ENV}_learning.png'}, {life / f'{CELL}_life.png'}")
+    print(f"Pictures: {trained / f'{ENV}_inferred.png'}, {trained / f'{ENV}_learning.png'}, {life / 'life.png'}")
     print(
         "Next:     battery-calibrate with a file of your own (docs/command_line.md), LAC with your environment (docs/lac.md)"
     )

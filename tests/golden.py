@@ -28,7 +28,7 @@ import torch as th
 from stable_baselines3 import SAC, TD3
 
 from battery_env import PolicyEstimator, evaluate, forecast, load_nasa_discharges, read_discharges, simulate, track_life
-from battery_env.__main__ import main as battery_calibrate
+from battery_env.__main__ import calibrate as battery_calibrate
 from battery_env.estimators import ClosedForm, ExtendedKalmanFilter, LeastSquares, cramer_rao_bound, fit_cell
 from battery_env.loads import BlockBootstrap, Cycle, Load
 from battery_env.sensors import RandomSensorErrors, SensorErrors

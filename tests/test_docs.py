@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from battery_env.__main__ import calibrate, main
+from battery_env.__main__ import calibrate
 from battery_env.estimators.reasons import Reason
 from sb3_lac.stability import fitting
 
@@ -126,9 +126,8 @@ def test_commands_of_the_calibrator_run_and_exit_as_their_page_says(tmp_path, mo
     for line in lines:
         words = shlex.split(line, comments=True)
         status = re.search(r"# exits (\d)", line)
-        command, arguments = (calibrate, words[1:]) if words[0] == "battery-calibrate" else (main, words[3:])
-        assert words[0] == "battery-calibrate" or words[:3] == ["python", "-m", "battery_env"], line
-        assert command(arguments) == int(status[1] if status else 0), line
+        assert words[0] == "battery-calibrate", line
+        assert calibrate(words[1:]) == int(status[1] if status else 0), line
 
 
 def test_the_first_page_shows_what_the_calibrator_prints(capsys):

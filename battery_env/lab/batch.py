@@ -20,15 +20,13 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from importlib import resources
-from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
 
-from battery_env.files import check_folder, check_new, locked, replacing
+from battery_env.files import check_folder, locked, replacing
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import Recording
@@ -37,12 +35,13 @@ from battery_env.lab.settings import Settings
 from battery_env.lab.sources import (
     LIFE,
     RUN,
-    TABLES,
+    TABLE,
     VOLTAGE,
     Source,
     few_of,
     find_sources,
     is_bundled,
+    is_result,
     key_of,
     no_formula,
     printable,
@@ -66,32 +65,16 @@ _CATCHING = threading.RLock()
 _Call = TypeVar("_Call")
 
 
-class Terminated(KeyboardInterrupt):
-    """The process is asked to end: by a scheduler, a service, or a terminal that goes."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__()
-        #: What a shell says of a process that this signal ended
-        self.status = 128 + number
-
-
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let the signals that ask a process to end do what Ctrl-C does; those that somebody else handles are left to it."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise Terminated(number)
-
-    is_main = threading.current_thread() is threading.main_thread()
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if is_main and hasattr(signal, name)]
-    ours = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
-    for number in ours:
-        signal.signal(number, interrupt)
+    """Let SIGTERM, by which schedulers and services end a process, do what Ctrl-C does."""
+    is_main = threading.current_thread() is threading.main_thread()  # no other may
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler) if is_main else None
     try:
         yield
     finally:
-        for number in ours:
-            signal.signal(number, signal.SIG_DFL)
+        if is_main:
+            signal.signal(signal.SIGTERM, before)
 
 
 class InThisProcess(Executor):
@@ -258,6 +241,11 @@ class Outcome:
     notes: str = ""
     error: str = ""
 
+    @property
+    def state(self) -> str:
+        """What became of it, in words."""
+        return "refused" if self.found is None else "settled" if self.found.settled else "not settled"
+
     def row(self) -> dict[str, Any]:
         """The columns of the table by name; no text is taken for a formula."""
         told = {"record": self.record, "source": self.source, "cell": self.cell, "cycle": self.cycle}
@@ -274,91 +262,83 @@ class Outcome:
 
 class Results:
     """
-    The files in a folder that results are written to. A row of the run is appended as each discharge is done, and whatever
+    The files in a folder that the results of one run are written to. A row is appended as each discharge is done, and whatever
     ends the command, the same one goes on from there: one with the same arguments, settings and version. Rows of files that
-    are not there at the moment stay. What is there of another command, or of somebody else, is refused; of another command it
-    may be replaced.
+    are not there at the moment stay. What is there of another run, or of somebody else, is refused; of another run it may be
+    replaced.
     """
 
     def __init__(
         self, folder: Path, sources: Sequence[Source], settings: Settings, file_format: FileFormat, with_voltages: bool = True
     ) -> None:
         self.folder, self.with_voltages, self._settings = folder, with_voltages, settings
+        self.run = folder / RUN
         self._stems = [record_name(source.stem, source.cycle) for source in sources]
-        is_one = len(sources) == 1 and _is_named(sources[0])
-        self._prefix = f"{self._stems[0]}_" if is_one else ""
-        self.run = folder / f"{self._prefix}{RUN}"
         self._stamps = {source.key: _stamp(source) for source in sources}
         read = sorted({key_of(source.given) for source in sources})
         made_with = {**asdict(settings), **asdict(file_format), "sources": read, "voltages": with_voltages}
         self._header: dict[str, Any] = json.loads(_json({"format": _FORMAT, "battery_env": VERSION, **made_with}))
         self._rows: dict[tuple[str, int], dict[str, Any]] = {}
         self._counts: dict[str, int] = {}
-        self._files: set[str] = set()
         check_folder(folder)
 
     @contextmanager
     def opened(self, replace: bool) -> Iterator[Results]:
         """Hold the folder against other commands, read what of the run is done, and refuse what may not be replaced."""
-        with locked(self.folder / RUN):
-            lines = self._read(replace)
-            others = [path for path in self._existing() if path.name not in self._files]
-            if others and not replace:
-                raise FileExistsError(
-                    f"{few_of(list(map(str, others)))} would be replaced; choose another --out, or give --force"
-                )
-            if others:
-                lines.append({"files": [path.name for path in others]})
-                self._files.update(path.name for path in others)
+        with locked(self.run):
+            header, lines = self._read()
+            goes_on = header == self._header and not replace
+            if not (goes_on or replace):
+                self._refuse_another(header, lines)
+            in_the_way = [] if replace else self._in_the_way(goes_on)
+            if in_the_way:
+                raise FileExistsError(f"{few_of(in_the_way)} would be replaced; choose another --out, or give --force")
+            kept = [line for line in lines if self._takes(line)] if goes_on else []
             # Only what is whole: a power cut may have left a part of the last line
             with replacing(self.run) as part:
-                part.write_text("".join(f"{_json(line)}\n" for line in (self._header, *lines)), encoding="ascii")
+                part.write_text("".join(f"{_json(line)}\n" for line in (self._header, *kept)), encoding="ascii")
             with self.run.open("ab") as self._stream:
                 yield self
 
-    def _read(self, replace: bool) -> list[dict[str, Any]]:
-        """The lines of this run that hold, but its header; none if there is no run."""
+    def _read(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        """What the run in the folder was made with, and its lines; nothing if there is none."""
         if not self.run.exists():
-            return []
+            return {}, []
         lines = [_line(text) for text in self.run.read_bytes().splitlines()]
         header = lines[0] if lines else {}
         if header.get("format") != _FORMAT:
             raise FileExistsError(f"{self.run} is no run of battery-calibrate: choose another --out, or move it elsewhere")
-        if replace:
-            return []
+        return header, lines[1:]
+
+    def _refuse_another(self, header: dict[str, Any], lines: list[dict[str, Any]]) -> None:
+        """Refuse to begin where another run has something to lose: a discharge that could be used."""
+        if all(line["row"]["error"] for line in lines if "row" in line):
+            return
         different = {name for name in header | self._header if header.get(name) != self._header.get(name)}
-        if different:
-            other = "battery_env" if "battery_env" in different else ", ".join(sorted(different - {"sources"}))
-            reads = f" that reads {few_of(header['sources'])}" if "sources" in header.keys() & different else ""
-            raise FileExistsError(
-                f"{self.run} is of a command{reads}{' with another ' if other else ''}{other}; choose another --out, or give "
-                "--force, which begins anew"
-            )
-        return [line for line in lines[1:] if self._takes(line)]
+        other = "battery_env" if "battery_env" in different else ", ".join(sorted(different - {"sources"}))
+        reads = f" that reads {few_of(header['sources'])}" if "sources" in header.keys() & different else ""
+        raise FileExistsError(
+            f"{self.run} is of a command{reads}{' with another ' if other else ''}{other}; choose another --out, or give "
+            "--force, which begins anew"
+        )
 
     def _takes(self, line: dict[str, Any]) -> bool:
         """Whether a line holds: of a file that is as it was, or not there."""
-        if "files" in line:
-            self._files.update(line["files"])
-            return True
         if not line.get("whole") or self._stamps.get(line["source"]) not in (None, line["stamp"]):
             return False
         self._rows[line["source"], line["number"]] = line["row"]
         self._counts[line["source"]] = line["of"]
         return True
 
-    def _existing(self) -> list[Path]:
-        if not self.folder.is_dir():
-            return []
+    def _in_the_way(self, goes_on: bool) -> list[str]:
+        """What has the name of a result: of a run that goes on only records, as all else is its own."""
         # the numbers of the discharges are not known before their files are read
         stems = "|".join(map(re.escape, self._stems))
         voltages = re.compile(rf"(?:{stems})(?:_\d+)*{VOLTAGE}\.(?:csv|png)", flags=re.IGNORECASE)
-        tables = {f"{self._prefix}{name}" for name in (*TABLES, LIFE)}
-        return [
-            path
-            for path in sorted(self.folder.iterdir())
-            if path.name in tables or (self.with_voltages and voltages.fullmatch(path.name))
-        ]
+        named = [path for path in sorted(self.folder.iterdir()) if self.with_voltages and voltages.fullmatch(path.name)]
+        if goes_on:
+            return [str(path) for path in named if path.suffix.lower() == ".csv" and not is_result(path)]
+        return [str(path) for path in (self.folder / TABLE, self.folder / LIFE, *named) if path.exists()]
 
     @property
     def done(self) -> list[Outcome]:
@@ -380,47 +360,33 @@ class Results:
         key, row = source.key, outcome.row()
         if not (outcome.error and (key, number) in self._rows):  # the file is gone since
             self._rows[key, number] = row
-        described = {"source": key, "stamp": self._stamps[key], "number": number, "of": count}
-        self._append({**described, "whole": whole and not outcome.error, "row": row})
+        line = {"source": key, "stamp": self._stamps[key], "number": number, "of": count, "whole": whole and not outcome.error}
+        self._stream.write(f"{_json({**line, 'row': row})}\n".encode("ascii"))
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
 
     def _sorted_rows(self) -> list[dict[str, Any]]:
         order = {key: number for number, key in enumerate(self._stamps)}
         keys = sorted(self._rows, key=lambda key: (order.get(key[0], len(order)), *key))
         return [self._rows[key] for key in keys]
 
-    def _append(self, line: dict[str, Any]) -> None:
-        self._stream.write(f"{_json(line)}\n".encode("ascii"))
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
-
-    def write(self, name: str, make: Callable[[Path], Any]) -> Path:
-        """Write a file of this run, which names it first. Of another's there is none of that name, or it is not touched."""
-        path, is_new = self.folder / name, name not in self._files
-        if is_new:
-            check_new(path)
-            self._append({"files": [name]})
-            self._files.add(name)
-        with replacing(path, new=is_new) as part:
+    def write(self, name: str, make: Callable[[Path], Any]) -> None:
+        """Write a file of this run."""
+        with replacing(self.folder / name) as part:
             make(part)
-        return path
 
-    def write_tables(self) -> list[Path]:
-        """Write the table of all rows and, if several are whole, a figure of them; one of voltages is named, too."""
+    def write_tables(self) -> None:
+        """Write the table of all rows, if any discharge could be used, and if several are whole a figure of them."""
+        if not self.has_numbers:
+            return
         table = pd.DataFrame(self._sorted_rows()).astype(_TYPES)
-        written = [self.write(f"{self._prefix}{TABLES[0]}", partial(table.to_csv, index=False))]
-        more: dict[str, Callable[[Path], Any]] = {}
-        if find_spec("pyarrow") is not None:
-            more[TABLES[1]] = partial(table.to_parquet, engine="pyarrow", index=False)
+        self.write(TABLE, partial(table.to_csv, index=False))
         whole = table[table["measured_eod_time_s"].notna()]
         if len(whole) > 1:
-            more[LIFE] = partial(_draw_life, whole)
-        for name, make in more.items():
             try:
-                written.append(self.write(f"{self._prefix}{name}", make))
+                self.write(LIFE, partial(_draw_life, whole))
             except Exception as error:  # whatever it is, the numbers are written
-                path = self.folder / f"{self._prefix}{name}"
-                warnings.warn(f"{path} is not written: {type(error).__name__}: {error}", stacklevel=2)
-        return [*written, *sorted(self.folder / name for name in self._files if name.endswith(f"{VOLTAGE}.png"))[:1]]
+                warnings.warn(f"{LIFE} is not written: {type(error).__name__}: {error}", stacklevel=2)
 
     @property
     def has_numbers(self) -> bool:
@@ -432,13 +398,6 @@ def _draw_life(whole: pd.DataFrame, path: Path) -> None:
     from battery_env.plotting import plot_life  # here, as matplotlib takes long to import
 
     plot_life(whole).savefig(path, dpi="figure")
-
-
-def _is_named(source: Source) -> bool:
-    """Whether an argument named a source itself, and no folder, which may not be there at the moment."""
-    path = Path(source.path)
-    is_no_folder = is_bundled(source.path) or path.is_file() or (path.suffix != "" and not path.is_dir())
-    return is_no_folder and key_of(source.given) == source.key
 
 
 def _stamp(source: Source) -> list[Any] | None:

@@ -17,11 +17,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from difflib import get_close_matches
-from functools import wraps
 from importlib.util import find_spec
-from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Literal, ParamSpec
+from typing import Any, Literal
 
 from battery_env.compiled import saying_that_it_compiles
 from battery_env.estimators.diagnosis.rest import InitialSoc
@@ -40,15 +38,14 @@ from battery_env.loads import constant
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
 
-#: What the process returns: all records settled, one or more refused, one or more not settled, Ctrl-C, nobody reads on.
+#: What the process returns: all records settled, one or more refused, one or more not settled, stopped, nobody reads on.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141
 
-_INSTALLED = "battery-calibrate"
+_NAME = "battery-calibrate"
 
 # So many discharges fit beside each other in the figure of a fit.
 _MOST_SHOWN = 4
 
-_P = ParamSpec("_P")
 _QUANTITY = re.compile(r",\s*(?=\w+=)")
 
 
@@ -57,16 +54,6 @@ def _assignments(text: str) -> dict[str, str]:
     if any(not (name.strip() and equals and value.strip()) for name, equals, value in pairs):
         raise argparse.ArgumentTypeError(f"expected quantity=NAME,quantity=NAME, got {text!r}")
     return {name.strip(): value.strip() for name, _, value in pairs}
-
-
-def _jobs(text: str) -> int:
-    try:
-        jobs = int(text)
-    except ValueError:
-        jobs = 0
-    if jobs != -1 and jobs < 1:
-        raise argparse.ArgumentTypeError(f"expected a number of processes, 1 or more, or -1 for one a core, got {text!r}")
-    return jobs
 
 
 def _initial_soc(text: str) -> InitialSoc | Literal["rest"]:
@@ -91,115 +78,6 @@ def _drawn(text: str) -> tuple[list[float], list[float], str]:
     return load.start_s.tolist(), load.value.tolist(), load.unit
 
 
-_Options = dict[tuple[str, ...], dict[str, Any]]
-
-_FILES: _Options = {
-    ("--columns",): {
-        "type": _assignments,
-        "metavar": "time=NAME,...",
-        "help": "names of the columns of time, voltage, current, temperature, ambient, cycle, step, state and cell, where "
-        "their names do not tell",
-    },
-    ("--units",): {
-        "type": _assignments,
-        "metavar": "time=UNIT,...",
-        "help": "their units, where the names do not tell: s, ms, min, h; V, mV; A, mA; degC, K",
-    },
-    ("--tester",): {
-        "type": find_tester,
-        "metavar": "FILE.toml",
-        "help": "how the tester writes its tables: a file that the command columns begins, or the name of one that is known "
-        "(default: told from the names)",
-    },
-    ("--ignore",): {
-        "action": "append",
-        "default": [],
-        "metavar": "COLUMN",
-        "help": "a column that is not looked at; may be given several times",
-    },
-}
-_SIGN: _Options = {
-    ("--discharge-is-negative",): {
-        "const": True,
-        "help": "the files count discharge as negative (default: told from the voltage)",
-    },
-    ("--discharge-is-positive",): {"const": False, "help": "or as positive"},
-}
-# What is given is an argument of Settings, whose defaults hold for the others
-_CALIBRATION: _Options = {
-    ("--method",): {
-        "choices": METHODS,
-        "help": "of calibration: least squares, the filter (kalman), or the policy that comes with the package (default: the "
-        "filter in progress at a constant load that goes on, without --prior and --cell; else least squares)",
-    },
-    ("--cut-off",): {
-        "dest": "cut_off_V",
-        "type": float,
-        "metavar": "V",
-        "help": "voltage at which the discharge ends, V (default: 2.7, or that of the fit of --cell)",
-    },
-    ("--prior", "--prior-q"): {
-        "dest": "prior_q_mobile_C",
-        "nargs": 2,
-        "type": float,
-        "metavar": ("MEAN", "SD"),
-        "help": "q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
-    },
-    ("--initial-soc",): {
-        "type": _initial_soc,
-        "metavar": "SOC",
-        "help": "state of charge when the load is switched on, after a rest: 0.8; with its standard deviation 0.8,0.02; or "
-        "rest: told from the voltage of a minute or more at rest before the load (default: 1, a full cell)",
-    },
-    ("--mismatch",): {
-        "dest": "mismatch_V",
-        "type": float,
-        "metavar": "V",
-        "help": "error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
-    },
-    ("--cell",): {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "constants of the cell, as the command fit saves them, or CellParameters.to_json; or how cells of its kind "
-        "age, as fit_life finds it and AgingPath.to_json saves it (default: those of a new 18650)",
-    },
-    ("--nominal",): {
-        "dest": "nominal_Ah",
-        "type": float,
-        "metavar": "AH",
-        "help": "nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this "
-        "load); it also tells what to expect of a cell in progress that is below 1 or above 4 Ah",
-    },
-    ("--ambient",): {
-        "dest": "ambient_C",
-        "type": float,
-        "metavar": "DEGC",
-        "help": "temperature of the surroundings, degC (default: the first one measured, or the model cell's 19 degC)",
-    },
-}
-_RESULTS: _Options = {
-    ("--out",): {
-        "type": Path,
-        "metavar": "DIR",
-        "help": "write the table of estimates (CSV, Parquet), the voltages and figures there",
-    },
-    ("--table-only",): {"action": "store_true", "help": "write no voltages of single discharges"},
-    ("--force",): {"action": "store_true", "help": "replace results that are there already"},
-    ("--json",): {"action": "store_true", "help": "print one JSON object a discharge and line"},
-    ("--jobs",): {
-        "type": _jobs,
-        "default": 1,
-        "metavar": "N",
-        "help": "processes; -1: one a core (default: %(default)s)",
-    },
-    ("--scheduler",): {
-        "metavar": "ADDRESS",
-        "help": "of a Dask cluster, tcp://host:port, whose workers read and calibrate; they must see the files by the same "
-        "names",
-    },
-}
-
-
 # What help begins with, before all options.
 _FIRST = """\
 q_max (the charge that can move), R_o (the resistance), health and the end of discharges, each from a full cell at rest.
@@ -214,17 +92,40 @@ examples:
 """
 
 
-def _parser(name: str) -> argparse.ArgumentParser:
-    parser = _reading(
-        name,
-        usage=f"{name} FILE [FILE ...] [options]\n       {name} B0005:100, for example; --help has more",
-        description=_FIRST.format("\n".join(f"  {_INSTALLED} {other:<10}{what}" for other, (_, what) in _OTHERS.items())),
+def _parser() -> argparse.ArgumentParser:
+    others = "\n".join(f"  {_NAME} {name:<10}{what}" for name, (_, what) in _COMMANDS.items() if name != "calibrate")
+    parser = argparse.ArgumentParser(
+        prog=_NAME,
+        usage=f"{_NAME} FILE [FILE ...] [options]\n       {_NAME} B0005:100, for example; --help has more",
+        description=_FIRST.format(others),
         epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"battery_env {VERSION}")
-    _add(parser.add_argument_group("calibration"), _CALIBRATION, default=argparse.SUPPRESS)
-    _add(parser.add_argument_group("results"), _RESULTS)
+    parser.add_argument("records", nargs="+", metavar="FILE", help=_FILE_HELP)
+    _add_reading(parser)
+    group = parser.add_argument_group("calibration")
+    group.add_argument(
+        "--method",
+        choices=METHODS,
+        help="of calibration: least squares, the filter (kalman), or the policy that comes with the package (default: the "
+        "filter in progress at a constant load that goes on, without --prior and --cell; else least squares)",
+    )
+    _add_calibration(group)
+    group = parser.add_argument_group("results")
+    group.add_argument(
+        "--out", type=Path, metavar="DIR", help="write the table of estimates, the voltages and figures there, for one run"
+    )
+    group.add_argument("--table-only", action="store_true", help="write no voltages of single discharges")
+    group.add_argument("--force", action="store_true", help="replace results that are there already")
+    group.add_argument("--json", action="store_true", help="print one JSON object a discharge and line")
+    group.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; -1: one a core (default: %(default)s)")
+    group.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a Dask cluster, tcp://host:port, whose workers read and calibrate; they must see the files by the same names",
+    )
     parser.add_argument(
         "--load",
         dest="drawn",
@@ -236,14 +137,17 @@ def _parser(name: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _fit_parser(name: str) -> argparse.ArgumentParser:
-    parser = _reading(
-        name,
+def _fit_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"{_NAME} fit",
         description="Fit the constants of the model to a few discharges of one cell, each from full charge to the cut-off, "
         "and save them for --cell of calibrate. Take three or more, of all ages and loads that they are to hold for.",
         epilog="Exit status: 0, 3 if the discharges may not have started full, are of one age or not of one cell, or 2 if one "
         "cannot be used or does not reach the cut-off, or the equations do not describe the cell.",
+        allow_abbrev=False,
     )
+    parser.add_argument("records", nargs="+", metavar="FILE", help=_FILE_HELP)
+    _add_reading(parser)
     group = parser.add_argument_group("fit")
     group.add_argument(
         "--cut-off", type=float, default=CUT_OFF_V, metavar="V", help="where the discharge ends, V (default: %(default)s)"
@@ -253,20 +157,22 @@ def _fit_parser(name: str) -> argparse.ArgumentParser:
         "--out",
         type=Path,
         required=True,
-        metavar="FILE.json",
-        help="write the fit there, and beside it a figure, FILE.png; neither may exist",
+        metavar="NAME.json",
+        help="write the fit there, and beside it a figure, NAME_fit.png; neither may exist",
     )
     return parser
 
 
-def _forecast_parser(name: str) -> argparse.ArgumentParser:
-    parser = _reading(
-        name,
-        many=False,
+def _forecast_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"{_NAME} forecast",
         description="Forecast the end of a discharge in progress, with an interval that holds nine of ten ends, from the life "
         "of its cell and the load to come.",
         epilog="Exit status: 0, 3 if something in the record contradicts the estimate, or 2 if something cannot be used.",
+        allow_abbrev=False,
     )
+    parser.add_argument("record", metavar="FILE", help=_FILE_HELP)
+    _add_reading(parser)
     group = parser.add_argument_group("forecast")
     group.add_argument(
         "--life",
@@ -283,98 +189,160 @@ def _forecast_parser(name: str) -> argparse.ArgumentParser:
         help="the load to come: time_s, from 0 at the last sample under load, and current_A or power_W, each held until the "
         "next (default: as so far)",
     )
-    known = ("--cut-off", "--prior", "--initial-soc", "--mismatch", "--cell", "--nominal", "--ambient")
-    options = {flags: how for flags, how in _CALIBRATION.items() if flags[0] in known}
-    _add(parser.add_argument_group("calibration"), options, default=argparse.SUPPRESS)
+    _add_calibration(parser.add_argument_group("calibration"))
     group = parser.add_argument_group("results")
     group.add_argument("--out", type=Path, metavar="DIR", help="write a figure and a JSON file there; neither may exist")
     group.add_argument("--json", action="store_true", help="print one JSON object")
     return parser
 
 
-def _add(group: Any, options: _Options, **common: Any) -> None:
-    for flags, how in options.items():
-        group.add_argument(*flags, **common, **how)
+_FILE_HELP = (
+    "text of any delimiter, .xlsx, .xls, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them, or "
+    "of folders; FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12"
+)
 
 
-def _reading(name: str, many: bool = True, **told: Any) -> argparse.ArgumentParser:
-    """The parser of a command that reads files."""
-    parser = argparse.ArgumentParser(prog=name, allow_abbrev=False, **told)
-    parser.add_argument(
-        "records" if many else "record",
-        nargs="+" if many else None,
-        metavar="FILE",
-        help="text of any delimiter, .xlsx, .xls, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of "
-        "them, or of folders; FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12",
-    )
+def _add_reading(parser: argparse.ArgumentParser) -> None:
+    """The options of all commands that read files."""
     group = parser.add_argument_group("reading")
-    _add(group, _FILES)
-    _add(group.add_mutually_exclusive_group(), _SIGN, action="store_const", dest="discharge_is_negative")
-    return parser
+    group.add_argument(
+        "--columns",
+        type=_assignments,
+        metavar="time=NAME,...",
+        help="names of the columns of time, voltage, current, temperature, ambient, cycle, step, state and cell, where their "
+        "names do not tell",
+    )
+    group.add_argument(
+        "--units",
+        type=_assignments,
+        metavar="time=UNIT,...",
+        help="their units, where the names do not tell: s, ms, min, h; V, mV; A, mA; degC, K",
+    )
+    group.add_argument(
+        "--tester",
+        type=find_tester,
+        metavar="FILE.toml",
+        help="how the tester writes its tables: a file that the command columns begins, or the name of one that is known "
+        "(default: told from the names)",
+    )
+    group.add_argument(
+        "--ignore",
+        action="append",
+        default=[],
+        metavar="COLUMN",
+        help="a column that is not looked at; may be given several times",
+    )
+    sign = group.add_mutually_exclusive_group()
+    sign.add_argument(
+        "--discharge-is-negative",
+        action="store_true",
+        default=None,
+        help="the files count discharge as negative (default: told from the voltage)",
+    )
+    sign.add_argument(
+        "--discharge-is-positive", action="store_false", dest="discharge_is_negative", default=None, help="or as positive"
+    )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command."""
+def _add_calibration(group: Any) -> None:
+    """Arguments of :class:`Settings`, whose defaults hold where none is given."""
+    group.add_argument(
+        "--cut-off",
+        dest="cut_off_V",
+        type=float,
+        metavar="V",
+        help="voltage at which the discharge ends, V (default: 2.7, or that of the fit of --cell)",
+    )
+    group.add_argument(
+        "--prior",
+        dest="prior_q_mobile_C",
+        nargs=2,
+        type=float,
+        metavar=("MEAN", "SD"),
+        help="q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
+    )
+    group.add_argument(
+        "--initial-soc",
+        type=_initial_soc,
+        metavar="SOC",
+        help="state of charge when the load is switched on, after a rest: 0.8; with its standard deviation 0.8,0.02; or rest: "
+        "told from the voltage of a minute or more at rest before the load (default: 1, a full cell)",
+    )
+    group.add_argument(
+        "--mismatch",
+        dest="mismatch_V",
+        type=float,
+        metavar="V",
+        help="error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
+    )
+    group.add_argument(
+        "--cell",
+        type=Path,
+        metavar="FILE",
+        help="constants of the cell, as the command fit saves them, or CellParameters.to_json; or how cells of its kind age, "
+        "as fit_life finds it and AgingPath.to_json saves it (default: those of a new 18650)",
+    )
+    group.add_argument(
+        "--nominal",
+        dest="nominal_Ah",
+        type=float,
+        metavar="AH",
+        help="nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this "
+        "load); it also tells what to expect of a cell in progress that is below 1 or above 4 Ah",
+    )
+    group.add_argument(
+        "--ambient",
+        dest="ambient_C",
+        type=float,
+        metavar="DEGC",
+        help="temperature of the surroundings, degC (default: the first one measured, or the model cell's 19 degC)",
+    )
+
+
+def calibrate(arguments: Sequence[str] | None = None) -> int:
+    """
+    The command ``battery-calibrate``, and the others by their names behind it. Errors are a line, an interruption another, and
+    a closed pipe none; each has its exit status.
+    """
     given = sys.argv[1:] if arguments is None else list(arguments)
-    parser = argparse.ArgumentParser(prog="python -m battery_env", description="Calibrate a battery model to real cells.")
-    parser.add_argument("--version", action="version", version=f"battery_env {VERSION}")
-    commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("calibrate", help="capacity and resistance of cells from their discharges", add_help=False)
-    for name, (_, what) in _OTHERS.items():
-        commands.add_parser(name, help=what, add_help=False)
-    asked = parser.parse_args(given[:1]).command
-    command = calibrate if asked == "calibrate" else _OTHERS[asked][0]
-    return command(given[1:], f"{parser.prog} {asked}")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a console that has not all characters shows their numbers
+            stream.reconfigure(errors="backslashreplace")
+    name = given.pop(0) if given and given[0] in _COMMANDS else "calibrate"
+    try:
+        with interruptible():
+            status = _COMMANDS[name][0](given)
+            sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # head, or a pager that was left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
+        return PIPE_CLOSED
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return REFUSED
+    return status
 
 
-def _ending(command: Callable[_P, int]) -> Callable[_P, int]:
-    """A command of which errors are a line, an interruption another, and a closed pipe none; each has its exit status."""
-
-    @wraps(command)
-    def run(*args: _P.args, **kwargs: _P.kwargs) -> int:
-        for stream in (sys.stdout, sys.stderr):
-            if isinstance(stream, io.TextIOWrapper):  # a console that has not all characters shows their numbers
-                stream.reconfigure(errors="backslashreplace")
-        try:
-            with interruptible():
-                status = command(*args, **kwargs)
-                sys.stdout.flush()
-        except KeyboardInterrupt as interruption:
-            print("interrupted", file=sys.stderr)
-            return getattr(interruption, "status", INTERRUPTED)
-        except BrokenPipeError:  # head, or a pager that was left
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
-            return PIPE_CLOSED
-        except (ValueError, TypeError, OSError, ImportError) as error:
-            print(f"error: {error}", file=sys.stderr)
-            return REFUSED
-        return status
-
-    return run
-
-
-@_ending
-def calibrate(arguments: Sequence[str] | None = None, name: str = _INSTALLED) -> int:
-    """The command ``calibrate``, which is also installed as ``battery-calibrate``, as are others by their names behind it."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    if name == _INSTALLED and given and given[0] in _OTHERS:
-        return _OTHERS[given[0]][0](given[1:], f"{name} {given[0]}")
-    if name == _INSTALLED and given and not Path(given[0]).exists() and (meant := get_close_matches(given[0], _OTHERS, 1)):
-        raise ValueError(f"no command and no file {given[0]!r}: did you mean {name} {meant[0]}?")
-    options = _parser(name).parse_args(given)
+def _calibrate(arguments: Sequence[str]) -> int:
+    """What discharges say; the exit status says whether all are settled."""
+    if arguments and not Path(arguments[0]).exists() and (meant := get_close_matches(arguments[0], _COMMANDS, 1)):
+        raise ValueError(f"no command and no file {arguments[0]!r}: did you mean {_NAME} {meant[0]}?")
+    options = _parser().parse_args(arguments)
     settings = _settings(options)
     settings.calibrator()  # what it refuses it refuses of every file
     with _saying():
         sources = find_sources(options.records)
     file_format = _file_format(options)
     if options.out is None:
-        return _calibrate(sources, settings, file_format, options, None)
+        return _calibrate_all(sources, settings, file_format, options, None)
     results = Results(options.out, sources, settings, file_format, not options.table_only)
     with results.opened(options.force):
-        return _calibrate(sources, settings, file_format, options, results)
+        return _calibrate_all(sources, settings, file_format, options, results)
 
 
-def _calibrate(
+def _calibrate_all(
     sources: Sequence[Source],
     settings: Settings,
     file_format: FileFormat,
@@ -383,30 +351,27 @@ def _calibrate(
 ) -> int:
     states: Counter[str] = Counter()
     first: Outcome | None = None
-    interrupted = None
+    is_interrupted = False
     if results and (done := len(results.done)):
         absent = f", {results.absent} of them of files that are not there now" if results.absent else ""
         print(f"going on: {done} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True)
     try:
-        with workers(options.jobs, options.scheduler) as executor:
-            ahead = 64 if options.scheduler or options.jobs == -1 else 2 * options.jobs
-            outcomes = calibrate_all(sources, file_format, settings, results, executor, ahead)
-            with saying_that_it_compiles():
-                waited_for = list(islice(outcomes, 1))
-            for outcome in chain(waited_for, outcomes):
+        with workers(options.jobs, options.scheduler) as executor, saying_that_it_compiles():
+            ahead = 64 if options.scheduler or options.jobs < 1 else 2 * options.jobs
+            for outcome in calibrate_all(sources, file_format, settings, results, executor, ahead):
                 _report(outcome, options.json)
                 if first is not None and not options.json:  # the only one is printed in full
                     for each in (first, outcome) if states.total() == 1 else (outcome,):
                         _print_line(each)
                 first = first or outcome
-                states[_state(outcome)] += 1
-    except KeyboardInterrupt as interruption:
+                states[outcome.state] += 1
+    except KeyboardInterrupt:
         print("interrupted: what is done is kept" + (", and the same command goes on" if results else ""), file=sys.stderr)
-        interrupted = getattr(interruption, "status", INTERRUPTED)
+        is_interrupted = True
     finally:
-        if results and results.has_numbers:
+        if results:
             with _saying():
-                written = results.write_tables()
+                results.write_tables()
     if not options.json:
         if states.total() > 1:
             counts = ", ".join(f"{states[state]} {state}" for state in ("settled", "not settled", "refused"))
@@ -414,18 +379,12 @@ def _calibrate(
             if settings.method == "policy":
                 print(f"calibrated by {CALIBRATED_BY[settings.method]}")
         elif first and first.found:
-            print(_coloured(text_of(first.record, first.found), first.found.settled))
+            print(text_of(first.record, first.found))
         if results and results.has_numbers:
-            print("\nwritten: " + ", ".join(map(str, written)))
-    if interrupted is not None:
-        return interrupted
+            print(f"\nwritten to {results.folder}")
+    if is_interrupted:
+        return INTERRUPTED
     return REFUSED if states["refused"] else NOT_SETTLED if states["not settled"] else SETTLED
-
-
-def _state(outcome: Outcome) -> str:
-    if outcome.error or outcome.found is None:
-        return "refused"
-    return "settled" if outcome.found.settled else "not settled"
 
 
 def _report(outcome: Outcome, as_json: bool) -> None:
@@ -439,7 +398,7 @@ def _report(outcome: Outcome, as_json: bool) -> None:
 
 def _print_line(outcome: Outcome) -> None:
     if outcome.found:
-        print(_coloured(line_of(outcome.record, outcome.found), outcome.found.settled), flush=True)
+        print(line_of(outcome.record, outcome.found), flush=True)
 
 
 def _file_format(options: argparse.Namespace) -> FileFormat:
@@ -450,18 +409,19 @@ def _file_format(options: argparse.Namespace) -> FileFormat:
 def _settings(options: argparse.Namespace) -> Settings:
     names = {field.name for field in fields(Settings)} - {"cell"}
     given: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in vars(options).items() if name in names
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in vars(options).items()
+        if name in names and value is not None
     }
     with _saying():
-        return Settings.for_file(vars(options).get("cell"), **given)
+        return Settings.for_file(options.cell, **given)
 
 
-@_ending
-def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_env fit") -> int:
+def _fit(arguments: Sequence[str]) -> int:
     """The command ``fit``; its exit status is 3 if there is doubt about the fit."""
-    options = _fit_parser(name).parse_args(arguments)
+    options = _fit_parser().parse_args(arguments)
     out: Path = options.out
-    picture = out.with_suffix(".png")
+    picture = out.with_name(f"{out.stem}_fit.png")
     if out.suffix != ".json":
         raise ValueError(f"the fit is written as JSON: --out {out.name}.json instead of {out.name}")
     check_new(out, picture)
@@ -483,10 +443,9 @@ def fit(arguments: Sequence[str] | None = None, name: str = "python -m battery_e
     return NOT_SETTLED if found.doubt else SETTLED
 
 
-@_ending
-def forecast(arguments: Sequence[str] | None = None, name: str = "python -m battery_env forecast") -> int:
+def _forecast(arguments: Sequence[str]) -> int:
     """The command ``forecast``; its exit status is 3 if something in the record contradicts the estimate."""
-    options = _forecast_parser(name).parse_args(arguments)
+    options = _forecast_parser().parse_args(arguments)
     from battery_env.lab.running import end_of_record, files_of  # here, as matplotlib takes long to import
 
     settings, file_format = _settings(options), _file_format(options)
@@ -505,11 +464,10 @@ def forecast(arguments: Sequence[str] | None = None, name: str = "python -m batt
     return NOT_SETTLED if end.contradicted else SETTLED
 
 
-@_ending
-def page(arguments: Sequence[str] | None = None, name: str = "python -m battery_env page") -> int:
+def _page(arguments: Sequence[str]) -> int:
     """The command ``page``: a page of this machine alone in a browser, until Ctrl-C."""
     parser = argparse.ArgumentParser(
-        prog=name,
+        prog=f"{_NAME} page",
         description="Open a page in the browser: drop files, see q_max, R_o, health and the life, forecast the end.",
         epilog="Needs the extra page: pip install 'battery_env[page]'. Nothing leaves this machine, or stays on its disk.",
         allow_abbrev=False,
@@ -522,11 +480,10 @@ def page(arguments: Sequence[str] | None = None, name: str = "python -m battery_
     return SETTLED
 
 
-@_ending
-def columns(arguments: Sequence[str] | None = None, name: str = "python -m battery_env columns") -> int:
+def _columns(arguments: Sequence[str]) -> int:
     """The command ``columns``; its exit status is 3 if the table lacks what a record needs."""
     parser = argparse.ArgumentParser(
-        prog=name,
+        prog=f"{_NAME} columns",
         description="Show the first lines of a table and what is recognised of it, and write a file to fill in: how its "
         "tester names its columns, for --tester of the other commands.",
         allow_abbrev=False,
@@ -544,23 +501,18 @@ def columns(arguments: Sequence[str] | None = None, name: str = "python -m batte
     with replacing(options.out, new=True) as part:
         part.write_text(tester_file(found.columns, opened.names, opened.rows), encoding="utf-8")
     then = "Fill in what is not found" if found.missing else "Change what is wrong"
-    print(f"\nwritten: {options.out}. {then}, and calibrate: {_INSTALLED} {options.record} --tester {options.out}")
+    print(f"\nwritten: {options.out}. {then}, and calibrate: {_NAME} {options.record} --tester {options.out}")
     return NOT_SETTLED if found.missing else SETTLED
 
 
-# The commands beside calibrate, with what they are for.
-_OTHERS: dict[str, tuple[Callable[..., int], str]] = {
-    "forecast": (forecast, "the end of a discharge in progress"),
-    "fit": (fit, "the constants of a cell from a few of its discharges"),
-    "columns": (columns, "what is recognised of a table, and a file to fill in for a tester that is not known"),
-    "page": (page, "all of it as a page in the browser"),
+# The commands, with what they are for.
+_COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
+    "calibrate": (_calibrate, "capacity and resistance of cells from their discharges"),
+    "forecast": (_forecast, "the end of a discharge in progress"),
+    "fit": (_fit, "the constants of a cell from a few of its discharges"),
+    "columns": (_columns, "what is recognised of a table, and a file to fill in for a tester that is not known"),
+    "page": (_page, "all of it as a page in the browser"),
 }
-
-
-def _coloured(text: str, settled: bool) -> str:
-    """What is not settled is yellow at a terminal (https://no-color.org)."""
-    is_plain = settled or not sys.stdout.isatty() or "NO_COLOR" in os.environ
-    return text if is_plain else f"\033[33m{text}\033[0m"
 
 
 @contextmanager

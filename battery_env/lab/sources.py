@@ -14,8 +14,8 @@ from battery_env.lab.readers.discharges import Recording, read_recordings
 from battery_env.lab.readers.tables import BINARY_SUFFIXES, NUMBERED_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
 from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
 
-#: Results that an earlier command wrote among the records, as their names end: rows, tables of them, voltages, a figure.
-RUN, TABLES, VOLTAGE, LIFE = "estimate.jsonl", ("estimate.csv", "estimate.parquet"), "_voltage", "life.png"
+#: Results that an earlier command wrote among the records: rows, the table of them, voltages, a figure.
+RUN, TABLE, VOLTAGE, LIFE = "estimate.jsonl", "estimate.csv", "_voltage", "life.png"
 # How those begin that a record may be called as.
 _RESULT_HEADS = (b"record,source,cell,cycle,", b"time_s,voltage_V,current_A,model_V\n")
 _NASA_SUFFIX = ".mat"
@@ -95,10 +95,10 @@ def _records(folder: Path) -> list[Path]:
         for path in (Path(parent, name) for name in names if not name.startswith(".")):
             if path.name in _NO_RECORDS or not is_readable(path, (_NASA_SUFFIX,)):
                 other.append(path)
-            elif not _is_result(path):
+            elif not is_result(path):
                 records.append(path)
     left_out = [
-        printable(path.relative_to(folder).as_posix()) for path in sorted(other, key=_by_number) if not _is_result(path)
+        printable(path.relative_to(folder).as_posix()) for path in sorted(other, key=_by_number) if not is_result(path)
     ]
     if records and left_out:
         warnings.warn(f"{folder}: {few_of(left_out)} left out, by their names no records", stacklevel=3)
@@ -125,19 +125,17 @@ def _names(file: Path, folders: Collection[Path]) -> tuple[str, str]:
     return f"{_plain(cell.replace('/', '_'))}_{_stem(file)}", _plain(cell)
 
 
-def _is_result(path: Path) -> bool:
-    """Whether an earlier command wrote a file, which its name and its content tell; those that no record has the name of."""
-    if path.suffix == ".csv":
-        if not path.is_file():  # to open a pipe is to wait for it
-            return False
-        try:
-            with path.open("rb") as stream:
-                return stream.read(64).startswith(_RESULT_HEADS)
-        except OSError:
-            return False
-    if path.suffix == ".parquet":
-        return path.name.endswith(TABLES[1]) and _is_result(path.with_suffix(".csv"))
-    return path.name.endswith((RUN, LIFE)) or (path.suffix == ".png" and _is_result(path.with_suffix(".csv")))
+def is_result(path: Path) -> bool:
+    """Whether an earlier command wrote a file: a table tells by its header, as a record may have its name."""
+    if path.suffix != ".csv":
+        return path.name in (RUN, LIFE) or path.name.endswith(f"{VOLTAGE}.png")
+    if not path.is_file():  # to open a pipe is to wait for it
+        return False
+    try:
+        with path.open("rb") as stream:
+            return stream.read(64).startswith(_RESULT_HEADS)
+    except OSError:
+        return False
 
 
 def _stem(path: Path) -> str:

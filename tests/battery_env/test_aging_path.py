@@ -13,7 +13,8 @@ from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SPREAD_SD, cell_with
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.estimates import last_estimate
-from battery_env.lab.command_line import SETTLED, forecast
+from battery_env.lab.command_line import SETTLED
+from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.life import track_life
 from battery_env.lab.settings import Settings
 from battery_env.loads import RandomPiecewise, constant
@@ -262,7 +263,7 @@ class TestCalibrations:
         assert abs(found.predicted_eod_time_s - measured_s) < 1.64 * found.sd_predicted_eod_time_s
         csv = tmp_path / "running.csv"
         pd.DataFrame({name: getattr(running, name) for name in ("time_s", "voltage_V", "current_A")}).to_csv(csv, index=False)
-        assert forecast([str(csv), "--cell", str(file), "--json"]) == SETTLED  # nothing contradicts it
+        assert command(["forecast", str(csv), "--cell", str(file), "--json"]) == SETTLED  # nothing contradicts it
         told = json.loads(capsys.readouterr().out)
         assert told["eod_time_s"][1] == pytest.approx(found.predicted_eod_time_s, rel=0.01)
 

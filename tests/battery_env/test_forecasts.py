@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from battery_env import NEW_CELL, Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
-from battery_env.__main__ import calibrate, main
+from battery_env.__main__ import calibrate
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.estimates import last_estimate
@@ -330,7 +330,7 @@ class TestCommand:
 
     def row(self, capsys, *arguments, status=0):
         capsys.readouterr()
-        assert main(["forecast", *arguments, "--json"]) == status
+        assert calibrate(["forecast", *arguments, "--json"]) == status
         return json.loads(capsys.readouterr().out)
 
     def wide_sd_C(self, capsys):
@@ -340,7 +340,7 @@ class TestCommand:
         Path("other").mkdir()
         Path("lab/life.csv").rename("other/life.csv")
         pd.read_csv("other/life.csv").query("cycle < 3").to_csv("lab/life.csv", index=False)
-        assert main(["forecast", "running.csv", "--life", "lab", "other"]) == 0
+        assert calibrate(["forecast", "running.csv", "--life", "lab", "other"]) == 0
         assert "the records of lab, other are taken for one cell's" in capsys.readouterr().err
 
     @pytest.mark.parametrize(
@@ -349,12 +349,12 @@ class TestCommand:
     )
     def test_a_load_that_draws_nothing_is_refused(self, capsys, load, message):
         Path("profile.csv").write_text(load)
-        assert main(["forecast", "running.csv", "--prior", "5460", "55", "--load", "profile.csv"]) == 2
+        assert calibrate(["forecast", "running.csv", "--prior", "5460", "55", "--load", "profile.csv"]) == 2
         assert message in capsys.readouterr().err
 
     def test_life_and_load_give_the_end_that_python_gives(self, capsys):
         Path("running.csv").rename("run_2.5A.csv")
-        assert main(["forecast", "run_2.5A.csv", "--life", "lab", "--load", "profile.csv", "--out", "out"]) == 0
+        assert calibrate(["forecast", "run_2.5A.csv", "--life", "lab", "--load", "profile.csv", "--out", "out"]) == 0
         shown = capsys.readouterr()
         assert "life of 10 earlier discharges" in shown.out and "then a given load" in shown.out and "health" not in shown.out
         assert "notes.txt is left out" in shown.err
@@ -369,7 +369,7 @@ class TestCommand:
         # the charge that 2 A draw until the end, and what is over at once under 3 A
         assert written["eod_time_s"][1] < 1800.0 + (2.0 * (self.end_s - 1200.0) - 600.0) / 3.0
         assert Path("out/run_2.5A_forecast.png").read_bytes().startswith(b"\x89PNG")
-        assert main(["forecast", "run_2.5A.csv", "--out", "out"]) == 2
+        assert calibrate(["forecast", "run_2.5A.csv", "--out", "out"]) == 2
         assert "run_2.5A_forecast.json, out/run_2.5A_forecast.png would be replaced" in capsys.readouterr().err
 
     @pytest.mark.parametrize("size", sweep(0.3, 0.05, 2.5, 10.0, 100.0))
@@ -414,7 +414,7 @@ class TestCommand:
         assert self.row(capsys, "folder/6.csv", "--life", "folder")["life_discharges"] == 5
 
     def test_a_discharge_that_has_ended_is_not_forecast(self, capsys):
-        assert main(["forecast", "lab/life.csv"]) == 2
+        assert calibrate(["forecast", "lab/life.csv"]) == 2
         assert "reaches 2.7 V at" in capsys.readouterr().err
 
     def test_of_its_own_file_only_what_came_before_counts(self, capsys):
@@ -445,7 +445,7 @@ class TestCommand:
         columns = {"time_s": pulses.time_s, "voltage_V": pulses.voltage_V, "current_A": pulses.current_A}
         pd.DataFrame(columns).to_csv("pulsed.csv", index=False)
         end = self.row(capsys, name, *options.split())
-        main(["calibrate", name, *options.split(), "--json"])
+        calibrate([name, *options.split(), "--json"])
         row = json.loads(capsys.readouterr().out)
         low_s, median_s, high_s = end["eod_time_s"]
         assert row["predicted_eod_time_s"] == median_s and row["remaining_s"] == end["remaining_s"][1]
@@ -494,7 +494,7 @@ class TestCommand:
     def test_what_cannot_be_meant_is_refused_and_nothing_is_written(self, arguments, message, capsys):
         Path("late.csv").write_text("time_s,power_W\n10,4\n20,5\n")
         before = sorted(Path().rglob("*"))
-        assert main(["forecast", *arguments]) == 2
+        assert calibrate(["forecast", *arguments]) == 2
         error = capsys.readouterr().err.splitlines()[-1]
         assert error.startswith("error: ") and message in error
         assert sorted(Path().rglob("*")) == before

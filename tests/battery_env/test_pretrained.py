@@ -20,7 +20,7 @@ from battery_env import (
     evaluate,
     load_nasa_discharges,
 )
-from battery_env.__main__ import main
+from battery_env.__main__ import calibrate as command
 from battery_env.estimates import last_estimate
 from battery_env.loads import Load
 from battery_env.policies.pretrained import file_stem, pretrained_card, pretrained_policy
@@ -168,7 +168,7 @@ class TestDamage:
             content = bytearray(path.read_bytes())
             content[len(content) // 2] ^= 4
             path.write_bytes(content)
-        assert main(["calibrate", "B0005:100", "--method", "policy"]) == 2
+        assert command(["B0005:100", "--method", "policy"]) == 2
         assert "is damaged" in capsys.readouterr().err
 
     @pytest.mark.parametrize("text", ["{", "[]", "{}", "null", '{"sha256": 3}'[:-1], '{"options": {}}'])

@@ -19,7 +19,6 @@ from scipy.io import savemat
 from battery_env import Settings, calibrate, load_nasa_discharges, read_discharges
 from battery_env.lab.batch import calibrate_all
 from battery_env.lab.command_line import calibrate as command
-from battery_env.lab.command_line import main
 from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.discharges import read_recordings
 from battery_env.lab.readers.testers import TESTERS
@@ -835,7 +834,7 @@ def test_a_tester_is_told_by_its_names_or_added_by_a_file(tmp_path, capsys, monk
     monkeypatch.chdir(tmp_path)
     table = pd.DataFrame({"Clock": RECORD.time_s / 60.0, "Pole(V)": RECORD.voltage_V, "Load": -1e3 * RECORD.current_A})
     table.to_csv("cell.csv", index=False)
-    assert main(["columns", "cell.csv"]) == 3
+    assert command(["columns", "cell.csv"]) == 3
     shown = capsys.readouterr().out
     assert "header      Clock, Pole(V), Load" in shown and "row 2       0.157" in shown and "time        not found" in shown
     text = Path("my_tester.toml").read_text()
@@ -848,9 +847,9 @@ def test_a_tester_is_told_by_its_names_or_added_by_a_file(tmp_path, capsys, monk
     units = units.replace('# time = ""', 'time = "min"').replace('# current = ""', 'current = "mA"')
     Path("my_tester.toml").write_text(f"{head}[units]{units}")
     same(read("cell.csv", tester="my_tester.toml"), atol=1e-3)
-    assert main(["calibrate", "cell.csv", "--tester", "my_tester.toml"]) == 0
+    assert command(["cell.csv", "--tester", "my_tester.toml"]) == 0
     assert calibrate("cell.csv", tester="my_tester.toml")[0].settled
-    assert main(["columns", "cell.csv"]) == 2  # nothing is overwritten
+    assert command(["columns", "cell.csv"]) == 2  # nothing is overwritten
     assert "my_tester.toml would be replaced" in capsys.readouterr().err
     faults = (("a = 1", "a tester has name"), ("[columns", "no file in TOML"), ("[columns]\nx='y'", "by quantity"))
     for content, said in faults:
@@ -914,7 +913,7 @@ def test_a_log_without_a_current_takes_a_stated_load(tmp_path, capsys):
     table.to_csv(path, index=False)
     end_s = RECORD.time_s[np.flatnonzero(LOADED)[-1]]
     load.write_text(f"time_s,current_A\n0,0\n14.5,2.01\n{end_s + 1.0},0\n")
-    assert main(["calibrate", str(path), "--load", str(load)]) == 0
+    assert command([str(path), "--load", str(load)]) == 0
     assert "1.4" in capsys.readouterr().out
 
 

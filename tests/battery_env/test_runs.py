@@ -27,13 +27,15 @@ from battery_env import Settings, load_nasa_discharges, read_discharges
 from battery_env.files import locked
 from battery_env.lab import batch, command_line
 from battery_env.lab.batch import attempt, workers
-from battery_env.lab.command_line import main
+from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.readers import tables
 from battery_env.lab.sources import find_sources
 from tests.faults import a_full_disk, squared_unless_it_ends_its_process
 from tests.sweeps import sweep
 
 ROWS = 8
+# of a discharge, without its rows
+VOLTAGES = {"csv": b"time_s,voltage_V,current_A,model_V\n", "png": b"picture"}
 
 
 def write(record, path, **more):
@@ -50,7 +52,7 @@ def lab(tmp_path_factory):
 
 
 def started(*arguments, **more):
-    command = [sys.executable, "-m", "battery_env", "calibrate", *map(str, arguments)]
+    command = [sys.executable, "-m", "battery_env", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **more)
 
 
@@ -85,7 +87,7 @@ def is_alive(pid):
 @pytest.fixture(scope="module")
 def undisturbed(lab, tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed")
-    assert main(["calibrate", str(lab), "--out", str(out), "--table-only"]) == 0
+    assert command([str(lab), "--out", str(out), "--table-only"]) == 0
     return (out / "estimate.csv").read_bytes()
 
 
@@ -103,12 +105,12 @@ def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed,
     if end == "worker":  # one takes its place
         assert process.returncode == 0, error
     else:
-        assert process.returncode == (-9 if end == signal.SIGKILL else 143)
+        assert process.returncode == (-9 if end == signal.SIGKILL else 130)
         done = rows_in(tmp_path)
         assert 3 <= done < ROWS
         if end == signal.SIGTERM:
             assert b"the same command goes on" in error and len(pd.read_csv(tmp_path / "estimate.csv")) == done
-        assert main(["calibrate", *map(str, arguments[:-2])]) == 0
+        assert command([*map(str, arguments[:-2])]) == 0
         shown = capsys.readouterr()
         assert f"going on: {done} discharges are done" in shown.err
         assert shown.out.count("\nc") == ROWS - 1 and f"{ROWS} discharges: {ROWS} settled" in shown.out
@@ -134,7 +136,7 @@ def quick(said, monkeypatch):
     """Calibration without its work: a discharge says what another one said, in files of a few bytes."""
     of_discharge, fit = said
     monkeypatch.setattr(batch, "calibrate", lambda discharge, settings: of_discharge)
-    monkeypatch.setattr(batch, "_voltages_of", lambda name, found: {"csv": b"voltages", "png": b"picture"})
+    monkeypatch.setattr(batch, "_voltages_of", lambda name, found: VOLTAGES)
     monkeypatch.setattr(batch, "_draw_life", lambda whole, path: path.write_bytes(b"life"))
     monkeypatch.setattr(command_line, "fit_cell", lambda *given, **more: fit)
     monkeypatch.setattr("battery_env.plotting.plot_cell_fit", lambda *given: Figure((1.0, 1.0)))
@@ -161,13 +163,13 @@ def pair(written_pair, tmp_path, monkeypatch):
 
 
 COMMANDS = {
-    "a folder": "calibrate lab --out out",
-    "its table": "calibrate lab --out out --table-only",
-    "a file of it": "calibrate lab/c1.csv --out out",
-    "some of it": "calibrate lab/c0.csv lab/c1.csv --out out",
-    "another folder": "calibrate other --out out",
-    "a file of the same name": "calibrate other/c1.csv --out out",
-    "other settings": "calibrate lab --out out --nominal 2",
+    "a folder": "lab --out out",
+    "its table": "lab --out out --table-only",
+    "a file of it": "lab/c1.csv --out out",
+    "some of it": "lab/c0.csv lab/c1.csv --out out",
+    "another folder": "other --out out",
+    "a file of the same name": "other/c1.csv --out out",
+    "other settings": "lab --out out --nominal 2",
     "a forecast": "forecast c1.csv --prior 7000 70 --out out",
     "a fit": "fit lab/c1.csv --out out/life.json",
     "another fit": "fit lab/c1.csv --out out/c1_voltage.json",
@@ -181,17 +183,17 @@ def contents(out):
 @pytest.mark.parametrize("ends", ["whole", "before its tables"])
 @pytest.mark.parametrize("first", sweep(*COMMANDS))
 def test_no_command_touches_what_another_one_wrote_to_the_same_folder(first, ends, quick, pair, capsys, monkeypatch):
-    if ends != "whole" and not COMMANDS[first].startswith("calibrate lab "):
+    if ends != "whole" and not COMMANDS[first].startswith("lab "):
         pytest.skip("others end whole or not at all")
     with monkeypatch.context() as patch:
         if ends != "whole":
             patch.setattr(batch.Results, "write_tables", lambda results: [])
-        assert main(COMMANDS[first].split()) in (0, 3)
+        assert command(COMMANDS[first].split()) in (0, 3)
     owners = dict.fromkeys(contents(pair / "out"), first)
     for name in (*(each for each in COMMANDS if each != first), first):
         before = contents(pair / "out")
         capsys.readouterr()
-        status, error = main(COMMANDS[name].split()), capsys.readouterr().err
+        status, error = command(COMMANDS[name].split()), capsys.readouterr().err
         after = contents(pair / "out")
         assert {file: after[file] for file in before if owners[file] != name or status == 2} == {
             file: content for file, content in before.items() if owners[file] != name or status == 2
@@ -201,41 +203,54 @@ def test_no_command_touches_what_another_one_wrote_to_the_same_folder(first, end
 
 
 def test_another_command_is_told_what_is_there_and_may_replace_it(quick, pair, capsys):
-    assert main("calibrate lab --out out".split()) == 0
+    assert command("lab --out out".split()) == 0
     for second, said in (
         ("other", f"estimate.jsonl is of a command that reads {pair}/lab; choose another --out, or give --force"),
         ("lab --nominal 2", "estimate.jsonl is of a command with another nominal_Ah; choose"),
         ("other --ignore x", f"that reads {pair}/lab with another ignore; choose"),
-        ("lab/c1.csv", "c1_voltage.csv, out/c1_voltage.png would be replaced; choose another --out, or give --force"),
     ):
         capsys.readouterr()
-        assert main(f"calibrate {second} --out out".split()) == 2
+        assert command(f"{second} --out out".split()) == 2
         assert said in capsys.readouterr().err
-    assert main("calibrate other --out out --force".split()) == 0
+    assert command("other --out out --force".split()) == 0
     assert pd.read_csv("out/estimate.csv")["source"].str.startswith("other").all()
-    assert main(f"calibrate ./other --out ../{pair.name}/out".split()) == 0
+    assert command(f"./other --out ../{pair.name}/out".split()) == 0
     assert "going on: 2 discharges are done" in capsys.readouterr().err
+
+
+def test_a_run_that_has_nothing_to_lose_gives_way_and_what_has_the_name_of_a_result_does_not(quick, pair, capsys):
+    assert command("lba --out out".split()) == 2 and set(contents(pair / "out")) == {"estimate.jsonl"}
+    Path("out/c1_voltage.csv").write_text("precious")
+    assert command("lab --out out".split()) == 2
+    assert "c1_voltage.csv would be replaced; choose another --out, or give --force" in capsys.readouterr().err
+    assert Path("out/c1_voltage.csv").read_text() == "precious"
+    assert command("lab --out out --force".split()) == 0 and Path("out/c1_voltage.csv").read_text() != "precious"
+    # a record among the results
+    shutil.copy("lab/c0.csv", "lab/c5.csv")
+    shutil.copy("lab/c0.csv", "out/c5_voltage.csv")
+    assert command("lab --out out".split()) == 2 and "c5_voltage.csv would be" in capsys.readouterr().err
+    assert command("lab --out out/c1_voltage.csv".split()) == 2 and "is a file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("left", [1, 0])
 def test_rows_of_files_that_are_not_there_are_kept(left, quick, pair, capsys):
-    assert main("calibrate lab --out out".split()) == 0
+    assert command("lab --out out".split()) == 0
     before = contents(pair / "out")
     for number in range(left, 2):
         Path(f"lab/c{number}.csv").rename(f"c{number}.away")
     capsys.readouterr()
-    assert main("calibrate lab --out out".split()) == (0 if left else 2)  # nothing is there to be read
+    assert command("lab --out out".split()) == (0 if left else 2)  # nothing is there to be read
     assert f"{2 - left} of them of files that are not there now" in capsys.readouterr().err
     assert list(pd.read_csv("out/estimate.csv")["record"])[-2:] == ["c0", "c1"]
     write(load_nasa_discharges("B0006")[3], Path("lab/c5.csv"))
-    assert main("calibrate lab --out out".split()) == 0
+    assert command("lab --out out".split()) == 0
     assert set(pd.read_csv("out/estimate.csv")["record"]) == {"c0", "c1", "c5"}
     Path("lab/c5.csv").unlink()
     for number in range(left, 2):
         Path(f"c{number}.away").rename(f"lab/c{number}.csv")
-    assert main("calibrate lab --out out".split()) == 0
+    assert command("lab --out out".split()) == 0
     after = contents(pair / "out")
-    assert {name for name in before if after[name] != before[name]} == {"estimate.csv", "estimate.jsonl", "estimate.parquet"}
+    assert {name for name in before if after[name] != before[name]} == {"estimate.csv", "estimate.jsonl"}
     assert set(pd.read_csv("out/estimate.csv")["record"]) == {"c0", "c1", "c5"}
 
 
@@ -248,45 +263,44 @@ def test_a_file_of_somebody_else_is_left_alone(content, quick, pair, capsys):
     run = pair / "out" / "estimate.jsonl"
     run.write_bytes(content)
     for more in ([], ["--force"]):
-        assert main(["calibrate", "lab", "--out", "out", *more]) == 2
+        assert command(["lab", "--out", "out", *more]) == 2
         assert "is no run of battery-calibrate: choose another --out, or move it" in capsys.readouterr().err
         assert contents(pair / "out") == {"estimate.jsonl": content}
     run.unlink()
-    assert main("calibrate lab --out out".split()) == 0
+    assert command("lab --out out".split()) == 0
     (pair / "out" / "c1_voltage.csv").unlink()
     (pair / "out" / "life.png").write_bytes(content)
-    assert main("calibrate lab --out out".split()) == 0  # its own, whoever changed it
+    assert command("lab --out out".split()) == 0  # its own, whoever changed it
 
 
 def test_one_command_at_a_time_writes_to_a_folder(quick, pair, capsys):
     with locked(Path("out/estimate.jsonl")):
-        for records in ("lab", "lab/c1.csv", "B0005:1"):
-            assert main(f"calibrate {records} --out out".split()) == 2
-            assert "is being written by another command: wait for it, or choose another --out" in capsys.readouterr().err
-    assert not contents(pair / "out") and main("calibrate lab/c1.csv --out out".split()) == 0
+        assert command("lab --out out".split()) == 2
+        assert "is being written by another command: wait for it, or choose another --out" in capsys.readouterr().err
+    assert not contents(pair / "out") and command("lab/c1.csv --out out".split()) == 0
 
 
 @pytest.mark.parametrize("left", sweep(b'{"source": "', b"", bytes(100), b"\xff\n", b"[]\n", b'{"source": 3}\n'))
 def test_what_a_power_cut_left_of_a_run_is_gone_on_from(left, quick, pair, monkeypatch):
-    arguments = "calibrate lab/c0.csv lab/c1.csv --out out --table-only".split()
-    assert main(arguments) == 0
+    arguments = "lab/c0.csv lab/c1.csv --out out --table-only".split()
+    assert command(arguments) == 0
     whole, run = Path("out/estimate.csv").read_bytes(), Path("out/estimate.jsonl")
     lines = run.read_bytes().splitlines(keepends=True)
     run.write_bytes(b"".join([*lines[:2], *lines[3:]]) + left)
     Path("out/estimate.csv").write_bytes(b"")
     calls = []
     monkeypatch.setattr(batch, "calibrate", lambda *call, made=batch.calibrate: calls.append(call) or made(*call))
-    assert main(arguments) == 0
+    assert command(arguments) == 0
     assert len(calls) == 1 and sorted(run.read_bytes().splitlines(keepends=True)) == sorted(lines)
     assert Path("out/estimate.csv").read_bytes() == whole
 
 
 def test_a_file_that_has_changed_is_read_again(pair, capsys):
-    arguments = "calibrate lab --out out --table-only".split()
-    assert main(arguments) == 0
+    arguments = "lab --out out --table-only".split()
+    assert command(arguments) == 0
     before = pd.read_csv("out/estimate.csv")
     write(load_nasa_discharges("B0006")[72], Path("lab/c1.csv"))
-    assert main(arguments) == 0
+    assert command(arguments) == 0
     assert "going on: 1 discharges are done" in capsys.readouterr().err
     again = pd.read_csv("out/estimate.csv")
     assert list(again["record"]) == ["c0", "c1"] and again["q_mobile_C"][0] == before["q_mobile_C"][0]
@@ -301,7 +315,7 @@ def test_no_text_of_a_table_is_a_formula(pair, capsys):
     cells.to_csv("=cells.csv", index=False)
     Path("=broken.csv").write_text("nothing")
     records = ["=1+1.csv", "+1.csv", "@SUM(A1).csv", "=HYPERLINK(0).csv.gz", "=cells.csv", "=broken.csv"]
-    assert main(["calibrate", *records, "--out", "out"]) == 2
+    assert command([*records, "--out", "out"]) == 2
     table = pd.read_csv("out/estimate.csv")
     texts = table.select_dtypes(exclude=["number", "bool"]).stack()
     assert len(table) == 8 and not texts[[isinstance(each, str) for each in texts]].str.match(r"[=+@-]").any()
@@ -326,30 +340,29 @@ def test_no_name_costs_a_row_or_a_picture_not_even_on_an_ascii_console(tmp_path)
     assert error == b"" and b"\x1b" not in printed and f"{len(HOSTILE)} discharges: {len(HOSTILE)} settled".encode() in printed
     table = pd.read_csv(out / "estimate.csv")
     assert table["notes"].isna().all() and table["record"].nunique() == len(HOSTILE) and (out / "life.png").exists()
-    assert pd.read_parquet(out / "estimate.parquet")["source"].tolist() == table["source"].tolist()
     assert not table["record"].str.match(r"[=+@-]").any() and not table["source"].str.contains("\x1b").any()
     for name in table["record"]:
         assert (out / f"{name}_voltage.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_what_cannot_be_written_beside_costs_no_row_and_is_made_by_the_same_command(lab, tmp_path, capsys):
-    arguments = ["calibrate", f"{lab}/c1.csv", f"{lab}/c2.csv", "--out", str(tmp_path)]
+    arguments = [f"{lab}/c1.csv", f"{lab}/c2.csv", "--out", str(tmp_path)]
     with a_full_disk(after_bytes=20_000):  # enough for the numbers
-        assert main(arguments) == 0
+        assert command(arguments) == 0
     table = pd.read_csv(tmp_path / "estimate.csv")
     assert table["settled"].all() and table["notes"].str.contains("voltage is not written: .*File too large").all()
     assert "life.png is not written: OSError" in capsys.readouterr().err
-    assert main(arguments) == 0
+    assert command(arguments) == 0
     assert pd.read_csv(tmp_path / "estimate.csv")["notes"].isna().all()
     assert {path.suffix for path in tmp_path.glob("*_voltage.*")} == {".csv", ".png"} and (tmp_path / "life.png").exists()
 
 
 def test_a_disk_that_is_full_is_said_and_the_same_command_goes_on(lab, undisturbed, tmp_path, capsys):
-    arguments = ["calibrate", str(lab), "--out", str(tmp_path), "--table-only"]
+    arguments = [str(lab), "--out", str(tmp_path), "--table-only"]
     with a_full_disk(after_bytes=6_000):
-        assert main(arguments) == 2
+        assert command(arguments) == 2
     assert "File too large" in capsys.readouterr().err and rows_in(tmp_path) > 2
-    assert main(arguments) == 0
+    assert command(arguments) == 0
     assert (tmp_path / "estimate.csv").read_bytes() == undisturbed
 
 
@@ -369,7 +382,7 @@ def test_what_cannot_be_looked_into_is_named_and_the_exit_status_says_so(lab, tm
         return scandir(path)
 
     monkeypatch.setattr(os, "scandir", closed)
-    assert main(["calibrate", str(tmp_path), "--json"]) == 2
+    assert command([str(tmp_path), "--json"]) == 2
     shown = capsys.readouterr()
     rows = {row["record"]: row["error"] for row in map(json.loads, shown.out.splitlines())}
     assert rows.keys() == {"closed", "gone", "good", "own_estimate", "pipe"}
