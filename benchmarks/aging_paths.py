@@ -157,7 +157,7 @@ def part(judged: str, every: int, folder: Path, method: str | None = None, **pol
     life = CELLS[judged]
     (path, own_path), discharges = (path_of([cell], folder)[0] for cell in (life, judged)), load_nasa_discharges(judged)
     labelled = load_nasa_discharges(life)
-    settings = {OWN_LIFE: Settings(cut_off_V=CUT_OFF_V), BOTH.format(life): Settings.for_cell(path, cut_off_V=CUT_OFF_V)}
+    settings = {OWN_LIFE: Settings(cut_off_V=CUT_OFF_V), BOTH.format(life): Settings(cell=path, cut_off_V=CUT_OFF_V)}
     lives = {name: track_life(discharges, CUT_OFF_V, _least_squares(each)) for name, each in settings.items()}
     rows: list[dict[str, object]] = []
     for n in range(1, len(discharges), every):

@@ -119,7 +119,7 @@ def part(cell: str, seed: int) -> Tables:
     """A cell: simulate its life, fit it, and forecast the discharges that were not fitted."""
     life, cut_off_V = simulated(cell, seed)
     fit = fit_cell([life[n] for n in FITTED], cut_off_V)
-    settings = Settings.for_cell(fit)
+    settings = Settings(cell=fit)
     rows: list[dict[str, Any]] = []
     for n, discharge in enumerate(life):
         if n in FITTED or n < BEFORE:

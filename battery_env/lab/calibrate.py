@@ -19,7 +19,7 @@ from typing_extensions import Unpack
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K
-from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.cell import TB
 from battery_env.electrochemistry.ends import quantile
 from battery_env.estimates import Estimate, last_estimate
@@ -95,8 +95,8 @@ def calibrate(
     :param source: one discharge, whole or in progress; a table or a file of them, see :func:`battery_env.read_discharges`; or
         what the command takes: a folder, ``"life.csv:2"``, or a bundled cell, as ``"B0005:100"``
     :param settings: how to look at them; ``None``: as ``options`` say
-    :param options: of :class:`Settings`, by name: ``cut_off_V``, ``nominal_Ah``, ``initial_soc``, ...; ``cell`` may be what
-        ``fit_cell`` found. Of tables and files what ``read_discharges`` takes, too
+    :param options: of :class:`Settings`, by name: ``cut_off_V``, ``nominal_Ah``, ``initial_soc``, ``cell``, ...; of tables and
+        files what ``read_discharges`` takes, too
     :return: what a discharge says; of other sources a list, without what cannot be used, of which warnings say why
     :raises ValueError: if none can be used
     :raises TypeError: for an option that there is not
@@ -106,7 +106,7 @@ def calibrate(
         meant = get_close_matches(name, known, 1)
         raise TypeError(f"calibrate takes no {name!r}: " + (f"did you mean {meant[0]}?" if meant else f"give {[*known]}"))
     of_file = {name: options.pop(name) for name in options.keys() - SettingsOptions.__annotations__.keys()}
-    settings = Settings.for_cell(**options) if settings is None else replace(settings, **options)
+    settings = Settings(**options) if settings is None else replace(settings, **options)
     if isinstance(source, Discharge):
         return calibrated(source, settings)
     file_format = FileFormat(**of_file | {"tester": find_tester(of_file.get("tester"))})
@@ -258,7 +258,7 @@ def _estimate(
 
 def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Estimate:
     """Without numbers where the search ended at its bound, as for a cell of far another size: a bound is no result."""
-    low_C, high_C = settings.q_mobile_bounds_C or Q_MOBILE.limits
+    low_C, high_C = settings.q_mobile_bounds_C
     if (
         "q_mobile" not in settings.parameters
         or low_C < (1.0 - _AT_BOUND) * estimate.q_mobile < (1.0 - _AT_BOUND) ** 2 * high_C
@@ -285,8 +285,8 @@ def _end(
     """What may come after a record; ``None`` if nothing can be told, or is asked of a record that has ended."""
     if not (part.in_progress or is_asked):
         return None
-    if settings.prior_q_mobile_C is None and settings.cell_q_mobile_C is not None:
-        estimate = estimate.within(*settings.cell_q_mobile_C)
+    if settings.prior_q_mobile_C is None and settings.fit is not None:
+        estimate = estimate.within(*settings.fit.life_q_mobile_C)
     try:
         end = forecast(
             part.record,
@@ -362,7 +362,7 @@ def _cell_at_the_temperature(record: Discharge, settings: Settings) -> CellParam
     The constants of the model in the surroundings that are stated, measured at load-on, or known of the record. Those of a
     path, or that a policy has learned of, hold at one temperature.
     """
-    cell, ambient_C = settings.cell or NEW_CELL, settings.ambient_C
+    cell, ambient_C = settings.constants, settings.ambient_C
     if ambient_C is None and record.temperature_C is not None:
         ambient_C = float(record.temperature_C[0])
     elif ambient_C is None:

@@ -39,7 +39,6 @@ _NOT_FOR_POLICIES = (
     "mismatch_V",
     "current_gain_sd",
     "ambient_C",
-    "q_mobile_bounds_C",
     "initial_soc",
 )
 # Nor may be said beside a path: it tells which of all go together, at the temperature of its lives.
@@ -47,24 +46,19 @@ _NOT_WITH_PATH = ("parameters", "ambient_C")
 
 
 class SettingsOptions(TypedDict, total=False):
-    """Keywords of :class:`Settings`; ``cell`` may be all that is known of it, as :meth:`Settings.for_cell` takes it."""
+    """Keywords of :class:`Settings`."""
 
     method: Method | None
     parameters: tuple[str, ...]
-    cut_off_V: float
+    cut_off_V: float | None
     prior_q_mobile_C: tuple[float, float] | None
-    mismatch_V: float
+    mismatch_V: float | None
     current_gain_sd: float
-    thermal: bool
+    thermal: bool | None
     ambient_C: float | None
     nominal_Ah: float | None
     cell: CellFit | AgingPath | CellParameters | None
-    cell_currents_A: tuple[float, float] | None
-    cell_q_mobile_C: tuple[float, float] | None
     cell_rates_sd: Mapping[str, float] | None
-    cell_sd_r_o_ohm: float
-    path: AgingPath | None
-    q_mobile_bounds_C: tuple[float, float] | None
     initial_soc: InitialSoc | Literal["rest"]
 
 
@@ -78,27 +72,22 @@ class Settings:
         which neither a prior nor the constants are known, and else least squares. ``"policy"`` is the one that comes with the
         package, for both parameters; its model is a new 18650 at constant temperature
     :param parameters: which to search for; the other is held at the cell's value
-    :param cut_off_V: voltage at which the discharge ends, V
+    :param cut_off_V: voltage at which the discharge ends, V; ``None``: where that of the fit of ``cell`` does, or 2.7
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
-    :param mismatch_V: error to expect of the model itself, V
+    :param mismatch_V: error to expect of the model itself, V; ``None``: that of the fit of ``cell``, or 0.05
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
-    :param thermal: whether the temperature of the model moves
+    :param thermal: whether the temperature of the model moves; ``None``: as in the fit of ``cell``, or that it does
     :param ambient_C: temperature at the start and of the surroundings, degC; ``None``: the first one measured, or what
         else the record says of its surroundings, or the cell's
     :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: the charge that ``cell``, with its
         own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``.
         Where nothing else is known, it tells the ``q_mobile`` of a cell of another size than a new 18650, in progress
-    :param cell: constants of the model; ``None``: those of a new 18650
-    :param cell_currents_A: lowest and highest mean current that these constants were fitted to, A: beyond them by more than a
-        quarter no estimate is settled, and no nominal capacity is told. ``None``: they hold for all
-    :param cell_q_mobile_C: between which ``q_mobile`` a cell with these constants has over its life, C: what the end of a
-        discharge in progress keeps to, of which no prior is known. ``None``: that is not known
+    :param cell: constants of the model, or all that ``fit_cell`` found: beyond the loads of the fit by more than a quarter no
+        estimate is settled, and no nominal capacity is told. Or how cells of its kind age, as ``fit_life`` found it, which is
+        for least squares. ``None``: the constants of a new 18650
     :param cell_rates_sd: how well the rate constants of ``cell`` are known: standard deviations of their logarithms, by name,
-        for least squares. ``None``: those of a new 18650 as any cell of any kind may differ from them
+        for least squares. ``None``: those of the fit; those of a new 18650 as any cell of any kind may differ from them
         (:data:`battery_env.estimators.cell_fit.RATE_PRIOR_SD`), and stated ones as cells of a kind do
-    :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``, ohm, for the filter
-    :param path: how cells of this kind age, which least squares take for a prior; :meth:`for_cell` sets what goes with it
-    :param q_mobile_bounds_C: where to search for ``q_mobile``, C; ``None``: where the calibrator does by default
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: told from the voltage of the rest before the load, of a minute at least
     :raises ValueError: for an argument out of range, and for what a policy cannot be told. What the calibrators refuse they
@@ -107,20 +96,15 @@ class Settings:
 
     method: Method | None = None
     parameters: tuple[str, ...] = PARAMETER_NAMES
-    cut_off_V: float = CUT_OFF_V
+    cut_off_V: float = None  # type: ignore[assignment]  # it is a number as soon as the settings are made
     prior_q_mobile_C: tuple[float, float] | None = None
-    mismatch_V: float = UNFITTED_MISMATCH_V
+    mismatch_V: float = None  # type: ignore[assignment]
     current_gain_sd: float = 0.005
-    thermal: bool = True
+    thermal: bool = None  # type: ignore[assignment]
     ambient_C: float | None = None
     nominal_Ah: float | None = None
-    cell: CellParameters | None = None
-    cell_currents_A: tuple[float, float] | None = None
-    cell_q_mobile_C: tuple[float, float] | None = None
+    cell: CellFit | AgingPath | CellParameters | None = None
     cell_rates_sd: Mapping[str, float] | None = None
-    cell_sd_r_o_ohm: float = 0.0
-    path: AgingPath | None = None
-    q_mobile_bounds_C: tuple[float, float] | None = None
     initial_soc: InitialSoc | Literal["rest"] = 1.0
 
     def __post_init__(self) -> None:
@@ -131,47 +115,50 @@ class Settings:
         low, high = _AMBIENT_LIMITS_C
         if self.ambient_C is not None and not low <= self.ambient_C <= high:
             raise ValueError(f"the ambient temperature must lie within {low:g} .. {high:g} degC, got {self.ambient_C!r}")
-        if not 0.0 < self.cut_off_V < np.inf:
-            raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
+        for name, value in self._known_of_the_cell().items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
         if self.path is not None:
             if self.method not in (None, "least-squares"):
                 raise ValueError(f"a path of aging cells is for least squares, got the method {self.method!r}")
-            if self.cell != self.path.cell:
-                raise ValueError("a path of aging cells comes with its constants: take Settings.for_cell(path)")
             self._refuse_stated(_NOT_WITH_PATH, "a path of aging cells", "leave the path out")
         if self.method == "policy":
             self._refuse_stated(_NOT_FOR_POLICIES, "the policy that comes with the package", "take another method")
+        if not 0.0 < self.cut_off_V < np.inf:
+            raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
 
     def _refuse_stated(self, names: tuple[str, ...], what: str, other: str) -> None:
-        defaults = {field.name: field.default for field in fields(self)}
+        defaults = {field.name: field.default for field in fields(self)} | self._known_of_the_cell()
         for name in names:
             if getattr(self, name) != defaults[name]:
                 raise ValueError(f"{what} takes no {name}: leave it out, or {other}")
 
-    @classmethod
-    def for_cell(cls, cell: CellFit | AgingPath | CellParameters | None = None, **others: Any) -> Settings:
-        """
-        Settings that use all that is known of a cell.
+    def _known_of_the_cell(self) -> dict[str, Any]:
+        """What the cell tells where nothing else is stated."""
+        if isinstance(self.cell, CellFit | AgingPath):
+            thermal = isinstance(self.cell, CellFit) and self.cell.thermal
+            return {"cut_off_V": self.cell.cell.VEOD, "mismatch_V": self.cell.mismatch_V, "thermal": thermal}
+        return {"cut_off_V": CUT_OFF_V, "mismatch_V": UNFITTED_MISMATCH_V, "thermal": True}
 
-        :param cell: what ``fit_cell`` found; of cells of its kind what ``fit_life`` found; or the constants alone
-        :param others: further settings, which replace what the fit knows
-        """
-        if isinstance(cell, CellFit):
-            known: dict[str, Any] = {
-                "cut_off_V": cell.cell.VEOD,
-                "mismatch_V": cell.mismatch_V,
-                "thermal": cell.thermal,
-                "cell_currents_A": cell.currents_A,
-                "cell_q_mobile_C": cell.life_q_mobile_C,
-                "q_mobile_bounds_C": cell.q_mobile_bounds_C,
-                "cell_rates_sd": cell.rates_sd,
-                "cell_sd_r_o_ohm": cell.sd_r_o_ohm,
-            }
-            others, cell = {**known, **others}, cell.cell
-        elif isinstance(cell, AgingPath):
-            known = {"cut_off_V": cell.cell.VEOD, "mismatch_V": cell.mismatch_V, "thermal": False, "path": cell}
-            others, cell = {**known, **others}, cell.cell
-        return cls(**{"cell": cell, **others})
+    @property
+    def constants(self) -> CellParameters:
+        """Of the model."""
+        return self.cell.cell if isinstance(self.cell, CellFit | AgingPath) else self.cell or NEW_CELL
+
+    @property
+    def fit(self) -> CellFit | None:
+        """What discharges of the cell say about its constants, if that is known."""
+        return self.cell if isinstance(self.cell, CellFit) else None
+
+    @property
+    def path(self) -> AgingPath | None:
+        """How cells of its kind age, if that is known."""
+        return self.cell if isinstance(self.cell, AgingPath) else None
+
+    @property
+    def q_mobile_bounds_C(self) -> tuple[float, float]:
+        """Where to search for ``q_mobile``, C."""
+        return self.fit.q_mobile_bounds_C if self.fit else Q_MOBILE.limits
 
     @classmethod
     def for_file(cls, path: Path | None, **others: Any) -> Settings:
@@ -179,7 +166,7 @@ class Settings:
         Settings that use what a file says of a cell, if there is one; a fit that is in doubt is warned of.
 
         :param path: what the command fit, ``CellParameters.to_json`` or ``AgingPath.to_json`` wrote
-        :param others: further settings, as of :meth:`for_cell`
+        :param others: further settings, which replace what the file tells
         """
         if path is None:
             return cls(**others)
@@ -191,7 +178,7 @@ class Settings:
         cell = read_cell(path)
         if isinstance(cell, CellFit) and cell.doubt:
             warnings.warn(f"{path}: {cell.doubt}", stacklevel=2)
-        return cls.for_cell(cell, **others)
+        return cls(cell=cell, **others)
 
     def with_nominal_prior(self) -> Settings:
         """What a nominal capacity tells of a cell of another size than a new 18650, of which nothing else is known."""
@@ -206,9 +193,9 @@ class Settings:
 
     def other_load(self, current_A: float) -> str:
         """Why the constants may not hold for a mean current; empty if they do."""
-        if self.cell_currents_A is None or not current_A > 0.0:
+        if self.fit is None or self.fit.currents_A is None or not current_A > 0.0:
             return ""
-        low_A, high_A = self.cell_currents_A
+        low_A, high_A = self.fit.currents_A
         if low_A / _SAME_LOAD <= current_A <= high_A * _SAME_LOAD:
             return ""
         fitted = f"{low_A:.3g}" if low_A == high_A else f"{low_A:.3g} to {high_A:.3g}"
@@ -216,7 +203,7 @@ class Settings:
 
     def tells_new_capacity(self, current_A: float) -> bool:
         """Whether the constants tell what a new cell yields under a load: where they were fitted to this load alone."""
-        low_A, high_A = self.cell_currents_A or (current_A, current_A)
+        low_A, high_A = (self.fit and self.fit.currents_A) or (current_A, current_A)
         return self.cell is not None and high_A <= low_A * _SAME_LOAD and not self.other_load(current_A)
 
     def calibrator(
@@ -234,15 +221,16 @@ class Settings:
         stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
         common: dict[str, Any] = {
             "parameters": self.parameters,
-            "cell": cell or self.cell or NEW_CELL,
+            "cell": cell or self.constants,
             "thermal": self.thermal,
             "prior_q_mobile_C": self.prior_q_mobile_C,
             "current_gain_sd": self.current_gain_sd,
             "initial_soc": stated if start is None else (start.soc, start.sd_soc),
-            "q_mobile_bounds_C": Q_MOBILE.limits if self.q_mobile_bounds_C is None else self.q_mobile_bounds_C,
+            "q_mobile_bounds_C": self.q_mobile_bounds_C,
         }
         if self.method == "kalman":
-            return ExtendedKalmanFilter(mismatch_V=self.mismatch_V, cell_sd_r_o_ohm=self.cell_sd_r_o_ohm, **common)
+            sd_r_o_ohm = self.fit.sd_r_o_ohm if self.fit else 0.0
+            return ExtendedKalmanFilter(mismatch_V=self.mismatch_V, cell_sd_r_o_ohm=sd_r_o_ohm, **common)
         rates_sd = self._rates_sd()
         # constants that are anybody's, once they are free, explain as much of the error as q_mobile and r_o absorb
         is_explained = rates_sd is RATE_PRIOR_SD
@@ -259,6 +247,8 @@ class Settings:
             return {}
         if self.cell_rates_sd is not None:
             return self.cell_rates_sd
+        if self.fit is not None:
+            return self.fit.rates_sd
         if self.prior_q_mobile_C is not None:
             return {}
         return RATE_PRIOR_SD if self.cell is None else dict.fromkeys(RATE_PRIOR_SD, SAME_KIND_SD)

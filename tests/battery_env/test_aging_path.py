@@ -272,7 +272,7 @@ class TestCalibrations:
             assert calibrate(load_nasa_discharges("B0005")[n], cell=b0006).settled
 
     def test_the_life_of_the_cell_itself_goes_with_it(self, b0006):
-        discharges, settings = load_nasa_discharges("B0005")[76:81], Settings.for_cell(b0006, cut_off_V=2.7)
+        discharges, settings = load_nasa_discharges("B0005")[76:81], Settings(cell=b0006, cut_off_V=2.7)
         before = track_life(discharges[:-1], 2.7, settings.calibrator())
         # the model of each discharge is that with the constants that were found
         assert before.table["lasted_share"].to_numpy() == pytest.approx(1.0, abs=0.01)
@@ -291,9 +291,7 @@ class TestCalibrations:
     )
     def test_what_a_path_tells_is_not_said_twice(self, path, options, message):
         with pytest.raises(ValueError, match=message):
-            Settings.for_cell(path, **options)
-        with pytest.raises(ValueError, match="comes with its constants"):
-            Settings(path=path)
+            Settings(cell=path, **options)
 
 
 #: It leaves the estimate where the fit in its observation puts it.

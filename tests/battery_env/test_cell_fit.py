@@ -62,8 +62,8 @@ def test_a_fit_tells_how_much_the_cell_holds_before_its_knee_does(b0005_fit):
     assert low_C == pytest.approx(min(q_C) / 1.2, rel=0.05) and high_C == pytest.approx(1.2 * max(q_C))
     one = dataclasses.replace(b0005_fit, discharges=b0005_fit.discharges[1:2])
     assert one.life_q_mobile_C[0] == pytest.approx(0.7 * q_C[1] / 1.2)
-    settings = Settings.for_cell(b0005_fit)
-    unknown = dataclasses.replace(settings, cell_q_mobile_C=None)
+    settings = Settings(cell=b0005_fit)
+    unknown = dataclasses.replace(settings, cell=b0005_fit.cell, cell_rates_sd=b0005_fit.rates_sd)
     for other in load_nasa_discharges("B0006")[40:160:40]:
         start_s, end_s = other.load_on_time_s, other.eod_time_s(2.7)
         seen = other.until(start_s + 0.25 * (end_s - start_s))
@@ -243,7 +243,7 @@ class TestFiles:
             found = calibrate(record, cell=fit)
             assert found.settled == is_known == bool(found.nominal_Ah > 0.0)
             assert ("is none of those that the constants were fitted to" in found.reason) != is_known
-            running, settings = record.until(0.5 * record.time_s[-1]), Settings.for_cell(fit)
+            running, settings = record.until(0.5 * record.time_s[-1]), Settings(cell=fit)
             expected = forecast_end(running, settings, load=high_A, samples=10)
             assert bool(expected.nominal_Ah > 0.0)
             expected = forecast_end(running, settings, load=2.0 * high_A, samples=10)
@@ -251,19 +251,19 @@ class TestFiles:
             expected = forecast_end(running, settings, load=constant_load(4.0 * high_A, "power"), samples=10)
             assert any("is none of those" in note for note in expected.notes) and np.isnan(expected.nominal_Ah)
             # of several loads, the new cell is that of one
-            of_several = dataclasses.replace(settings, cell_currents_A=(0.5 * low_A, high_A))
-            assert np.isnan(calibrate(record, of_several).nominal_Ah)
+            slow = dataclasses.replace(fit.discharges[0], current_A=0.5 * low_A)
+            of_several = dataclasses.replace(fit, discharges=(slow, *fit.discharges))
+            assert np.isnan(calibrate(record, cell=of_several).nominal_Ah)
 
     @pytest.mark.parametrize("method", [method for method in METHODS if method != "policy"])
     def test_settings_use_all_that_a_fit_knows(self, method, fit):
-        settings = Settings.for_cell(fit, method=method)
-        assert (settings.cell, settings.mismatch_V, settings.cut_off_V) == (fit.cell, fit.mismatch_V, fit.cell.VEOD)
+        settings = Settings(cell=fit, method=method)
+        assert (settings.constants, settings.mismatch_V, settings.cut_off_V) == (fit.cell, fit.mismatch_V, fit.cell.VEOD)
         estimator, own = settings.calibrator(fit.cell), fit.calibrator()
         assert estimator.bounds == own.bounds and estimator.bounds["q_mobile"][1] == pytest.approx(1.2 * fit.cell.q_mobile)
-        assert Settings.for_cell(fit, mismatch_V=0.1).mismatch_V == 0.1
-        assert Settings.for_cell(OTHER) == Settings(cell=OTHER)
+        assert Settings(cell=fit, mismatch_V=0.1).mismatch_V == 0.1 and Settings(cell=OTHER).mismatch_V == 0.05
         assert Settings(method=method).calibrator(NEW_CELL).bounds == LeastSquares().bounds == ExtendedKalmanFilter().bounds
-        assert not Settings.for_cell(dataclasses.replace(fit, thermal=False)).thermal
+        assert not Settings(cell=dataclasses.replace(fit, thermal=False)).thermal
 
     @pytest.mark.parametrize(
         ("kind", "change", "message"),

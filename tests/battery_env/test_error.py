@@ -52,7 +52,7 @@ def test_rows_that_are_lost_together_with_their_time_are_seen(method, cell, cycl
 @pytest.mark.parametrize(("known", "other"), [("B0005", "B0006"), ("B0006", "B0005")])
 def test_a_cell_of_a_known_kind_is_settled_before_its_end(known, other):
     fit = fit_cell([load_nasa_discharges(known)[n] for n in (2, 80, 150)], cut_off_V=2.7)
-    settings, settled = Settings.for_cell(fit), 0
+    settings, settled = Settings(cell=fit), 0
     for discharge in load_nasa_discharges(other)[20:160:35]:
         whole = settings.calibrator().estimate(discharge.loaded_part(2.7))
         seen = discharge.until(0.98 * discharge.eod_time_s(2.7)).loaded_part(2.7)

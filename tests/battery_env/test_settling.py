@@ -378,13 +378,13 @@ class TestPrecision:
         """With an error stated too small it answered 4657 +- 84 C at half time; the whole discharge says 5986 C."""
         record = load_nasa_discharges("B0006")[64].loaded_part(2.7)
         seen = record.until(record.time_s[0] + share * (record.time_s[-1] - record.time_s[0]))
-        stated = [Settings.for_cell(young_fit, method=method, mismatch_V=0.0055) for method in METHODS[:2]]
+        stated = [Settings(cell=young_fit, method=method, mismatch_V=0.0055) for method in METHODS[:2]]
         fitted, filtered = (settings.calibrator().estimate(seen) for settings in stated)
         assert not filtered.settled and filtered.sd_q_mobile > 0.8 * fitted.sd_q_mobile
 
     def test_nor_is_it_by_a_prior(self, young_fit):
         record = load_nasa_discharges("B0006")[64].until(1800.0).loaded_part(2.7)
-        stated = Settings.for_cell(young_fit, method="kalman", prior_q_mobile_C=(4700.0, 90.0), mismatch_V=0.0055)
+        stated = Settings(cell=young_fit, method="kalman", prior_q_mobile_C=(4700.0, 90.0), mismatch_V=0.0055)
         estimate = stated.calibrator().estimate(record)
         assert estimate.reason.startswith("q_max rests on its prior") and estimate.sd_q_mobile < 92.0
 
