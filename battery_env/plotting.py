@@ -26,7 +26,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES, PARAMETERS, Q_MOBILE, R_O
-from battery_env.records import Record, switches
+from battery_env.records import Record
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import VoltageForecast
 
@@ -60,8 +60,6 @@ _OUTLIERS = 0.02
 _ROOM = 0.35
 # Stretches of time whose extremes are drawn of a long record: more than a figure is wide in dots.
 _STRETCHES = 2000
-# A load that is switched more often is drawn by its envelope.
-_FEW_SWITCHES = 60
 # A figure of a discharge in progress goes on for at most this many times its record, or its expected end.
 _LONGEST_SHOWN = 1.5
 # Title of the axis of each panel of a life, in the units of a lab, with the scale to them.
@@ -198,8 +196,7 @@ def plot_discharge(
     """
     The measured voltage of one discharge with that of the model at some estimates, the current, and the error of the model.
 
-    Of a long record the least and the greatest value in each of 2000 stretches of time are drawn. Under a load that is
-    switched often the stretches hold four switches each: what is drawn is the envelope, not a block of pulses.
+    Of a long record the least and the greatest value in each of 2000 stretches of time are drawn.
 
     :param record: one discharge, simulated or recorded
     :param forecasts: what :meth:`battery_env.RecordModel.forecast` made of estimates, by name for the legend
@@ -209,15 +206,14 @@ def plot_discharge(
     """
     figure = new_figure(6.4, 5.4)
     upper, middle, lower = panels = figure.subplots(3, 1, sharex=True, height_ratios=[5, 2, 3])
-    stretches = _stretches(record)
-    time_s, voltage_V = _drawn_points(record.time_s, record.voltage_V, stretches)
+    time_s, voltage_V = _drawn_points(record.time_s, record.voltage_V)
     upper.plot(time_s, voltage_V, "o", ms=2.2, color=COLOUR_OF["measured"], label="measured")
-    middle.plot(*_drawn_points(record.time_s, record.current_A, stretches), color=COLOUR_OF["measured"], lw=1.2)
+    middle.plot(*_drawn_points(record.time_s, record.current_A), color=COLOUR_OF["measured"], lw=1.2)
     lower.axhline(0.0, color="0.6", lw=0.8)
     for colour, (name, forecast) in coloured(forecasts.items()):
-        upper.plot(*_drawn_points(forecast.time_s, forecast.voltage_V, stretches), color=colour, lw=1.4, label=name)
+        upper.plot(*_drawn_points(forecast.time_s, forecast.voltage_V), color=colour, lw=1.4, label=name)
         error_mV = 1e3 * (forecast.at_samples_V - record.voltage_V)
-        lower.plot(*_drawn_points(record.time_s, error_mV, stretches), color=colour, lw=1.0, label=name)
+        lower.plot(*_drawn_points(record.time_s, error_mV), color=colour, lw=1.0, label=name)
     if end is not None:
         draw_end(upper, end)
     figure.suptitle(title, fontsize=10)
@@ -290,17 +286,11 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
     return _finished(figure, *panels.ravel())
 
 
-def _stretches(record: Record) -> int:
-    """How many stretches of time the points of a record are drawn by: fewer where each would show one pulse."""
-    count = len(switches(record.current_A))
-    return _STRETCHES if count <= _FEW_SWITCHES else min(_STRETCHES, count // 4)
-
-
-def _drawn_points(x: FloatArray, y: FloatArray, stretches: int = _STRETCHES) -> tuple[FloatArray, FloatArray]:
+def _drawn_points(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The points, or of many the least one of each stretch, then NaN, then the greatest: two lines, the envelope."""
-    if len(x) <= 2 * stretches:
+    if len(x) <= 2 * _STRETCHES:
         return x, y
-    edges = np.linspace(0, len(x), stretches + 1).astype(np.int64)
+    edges = np.linspace(0, len(x), _STRETCHES + 1).astype(np.int64)
     parts = [y[low:high] for low, high in itertools.pairwise(edges)]
     # NaN, where the model cell is empty, is neither least nor greatest; a stretch of nothing else stays a gap
     least = edges[:-1] + np.array([np.where(np.isnan(part), np.inf, part).argmin() for part in parts])

@@ -90,44 +90,36 @@ class InThisProcess(Executor):
         return future
 
 
-class Processes(Executor):
+class Processes(ThreadPoolExecutor):
     """
-    Makes calls in processes of this machine, which end with this one. A call whose process is lost is made once more: each has
-    one to itself, so that it alone can be the reason.
+    Makes calls in processes of this machine, one for each thread, which end with this one. A call whose process is lost is
+    made once more in a process of its own, so that it alone can be the reason.
     """
 
     def __init__(self, count: int) -> None:
-        self._threads = ThreadPoolExecutor(count)
-        self._idle: list[ProcessPoolExecutor] = []
+        super().__init__(count)
+        self._free: list[ProcessPoolExecutor] = []
         self._others = set(multiprocessing.active_children())
         self._ends = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Make a call as soon as a process is free."""
-        return self._threads.submit(self._make, partial(fn, *args, **kwargs))
+        return super().submit(self._make, partial(fn, *args, **kwargs))
 
     def _make(self, call: Callable[[], Any]) -> Any:
-        try:
-            return self._make_once(call)
-        except BrokenExecutor:
-            if self._ends:
-                raise
-            return self._make_once(call)
-
-    def _make_once(self, call: Callable[[], Any]) -> Any:
-        # spawn: torch does not survive a fork with threads
-        spawn = multiprocessing.get_context("spawn")
-        process = self._idle.pop() if self._idle else ProcessPoolExecutor(1, spawn, initializer=_end_with_parent)
-        future = process.submit(call)
-        if not isinstance(future.exception(), BrokenExecutor):
-            self._idle.append(process)
+        future = self._done_by_a_process(call)
+        if isinstance(future.exception(), BrokenExecutor) and not self._ends:
+            future = self._done_by_a_process(call)
         return future.result()
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Wait for what is under way."""
-        self._threads.shutdown(wait, cancel_futures=cancel_futures)
-        for process in self._idle if wait else ():
-            process.shutdown()
+    def _done_by_a_process(self, call: Callable[[], Any]) -> Future[Any]:
+        # spawn: torch does not survive a fork with threads
+        spawn = multiprocessing.get_context("spawn")
+        process = self._free.pop() if self._free else ProcessPoolExecutor(1, spawn, initializer=_end_with_parent)
+        future = process.submit(call)
+        if not isinstance(future.exception(), BrokenExecutor):
+            self._free.append(process)
+        return future
 
     def __exit__(self, *error: Any) -> None:
         """What has not begun is not begun any more, and after an error what has begun is not waited for."""
@@ -136,6 +128,8 @@ class Processes(Executor):
             for process in set(multiprocessing.active_children()) - self._others:
                 process.terminate()
         self.shutdown(cancel_futures=True)
+        for process in self._free:
+            process.shutdown()
 
 
 def _end_with_parent() -> None:

@@ -225,9 +225,7 @@ def title_of(name: str, found: Calibration) -> str:
     """The same above a figure."""
     parts = []
     for parameter, column in _COLUMN_OF.items():
-        spread = f" (sd {found.sd_of(column)})" if found.sd_of(column) else " (held)"
-        # a policy states none
-        value = found.shown(column).replace("mohm", r"m$\Omega$")
-        parts.append(f"{PARAMETERS[parameter].symbol} {value}" + ("" if found.method == "policy" else spread))
-    rmse = f"RMSE {found.shown('voltage_rmse_V', 0)}"
-    return f"{name}: {found.state}\n" + ", ".join([*parts, f"{found.shown('drawn_Ah')} drawn", rmse])
+        spread = f"sd {found.sd_of(column)}" if found.sd_of(column) else "held"
+        parts.append(f"{PARAMETERS[parameter].symbol} {found.shown(column)} ({spread})".replace("mohm", r"m$\Omega$"))
+    parts += [f"{found.shown('drawn_Ah')} drawn", f"RMSE {found.shown('voltage_rmse_V', 0)}"]
+    return f"{name}: {found.state}\n{', '.join(parts)}"
