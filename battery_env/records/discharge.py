@@ -1,20 +1,16 @@
-"""Recorded discharges of real cells, and NASA's files of them."""
+"""Recorded discharges of real cells, and those that come with the package."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field, fields
-from datetime import datetime, timedelta
 from functools import cached_property, lru_cache
 from importlib.resources import as_file, files
 from math import hypot
 from numbers import Real
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
-from scipy.io import loadmat
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive
@@ -345,7 +341,7 @@ class Discharge:
         return self._derived(**{name: None if (column := getattr(self, name)) is None else column[:n] for name in names})
 
 
-def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
+def load_nasa_discharges(cell: str) -> list[Discharge]:
     """
     All discharges of one cell of NASA's battery data set, in the order they were made. Cite it as ``NASA_CITATION``.
 
@@ -353,37 +349,24 @@ def load_nasa_discharges(path_or_cell: str | Path) -> list[Discharge]:
 
       from battery_env import load_nasa_discharges
 
-      discharges = load_nasa_discharges("B0005")  # or "B0006", or a .mat file of NASA's
+      discharges = load_nasa_discharges("B0005")  # or "B0006"
       print([(each.meta["cycle"], each.meta["capacity_Ah"]) for each in discharges[::40]])
       first = discharges[0].loaded_part(cut_off_V=2.7)  # what estimators take
 
-    Their ``meta`` holds ``cell``, ``cycle`` (1, 2, ... over the discharges), ``source`` and, as far as the file tells,
-    ``start_time``, ``ambient_temperature_C``, ``capacity_Ah`` (charge to 2.7 V), ``Re_ohm`` and ``Rct_ohm`` (of the impedance
-    test nearest in time) and ``test_id`` (position among all tests of the cell). A discharge that fails the checks of
-    :class:`Discharge` is left out with a warning.
+    Their ``meta`` holds ``cell``, ``cycle`` (1, 2, ... over the discharges), ``source``, ``start_time``,
+    ``ambient_temperature_C``, ``capacity_Ah`` (charge to 2.7 V), ``Re_ohm`` and ``Rct_ohm`` (of the impedance test nearest in
+    time) and ``test_id`` (position among all tests of the cell).
 
-    :param path_or_cell: a cell that comes with the package (``BUNDLED_CELLS``), or one of NASA's own files, such as
-        ``B0018.mat``
+    :param cell: one that comes with the package (``BUNDLED_CELLS``). NASA's own files of others, such as ``B0018.mat``, are
+        read by :func:`battery_env.read_discharges`
     :return: one :class:`Discharge` each
-    :raises FileNotFoundError: if there is no such cell or file
-    :raises ValueError: if the file is laid out in another way
+    :raises FileNotFoundError: if there is no such cell
     """
-    if path_or_cell in BUNDLED_CELLS:
-        return [each._derived(meta=dict(each.meta)) for each in _bundled(str(path_or_cell))]
-    path = Path(path_or_cell)
-    if not path.is_file():
-        raise FileNotFoundError(f"no file {str(path)!r}; the cells that come with the package are {', '.join(BUNDLED_CELLS)}")
-    if path.suffix.lower() != ".mat":
-        raise ValueError(f"{path} is none of NASA's .mat files: read it with read_discharges")
-    discharges = []
-    for arrays, meta in read_nasa_mat(path):
-        try:
-            discharges.append(Discharge(**arrays, meta=meta))
-        except (TypeError, ValueError) as error:
-            warnings.warn(f"{path}: discharge {meta['cycle']} is left out: {error}", stacklevel=2)
-    if not discharges:
-        raise ValueError(f"{path} holds no discharge that can be used")
-    return discharges
+    if cell not in BUNDLED_CELLS:
+        raise FileNotFoundError(
+            f"no cell {str(cell)!r} comes with the package, but {', '.join(BUNDLED_CELLS)}; read_discharges reads files"
+        )
+    return [each._derived(meta=dict(each.meta)) for each in _bundled(cell)]
 
 
 @lru_cache
@@ -399,53 +382,3 @@ def _bundled(cell: str) -> list[Discharge]:
         meta = {"cell": cell, "cycle": cycle, "source": NASA_CITATION, **known[cycle]}
         discharges.append(Discharge(time_s, voltage_V, current_A, temperature_C, meta))
     return discharges
-
-
-def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """The discharges of one of NASA's own files before they are checked."""
-    content: dict[str, Any] = {}
-    try:
-        content = loadmat(path, simplify_cells=True)
-        ((cell, value),) = ((name, value) for name, value in content.items() if isinstance(value, dict) and "cycle" in value)
-        return _samples_of_mat(cell, value)
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
-        names = ", ".join(name for name in content if not name.startswith("__"))
-        where = f"one of its variables ({names}) must be a cell with its cycles" if content else repr(error)
-        raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {where}") from error
-
-
-def _samples_of_mat(cell: str, value: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    tests = [(n, test, _start_time(test["time"])) for n, test in enumerate(np.atleast_1d(value["cycle"]))]
-    impedances = [(start, test["data"]) for _, test, start in tests if test["type"] == "impedance"]
-    discharges = [entry for entry in tests if entry[1]["type"] == "discharge"]
-    samples = []
-    for cycle, (n, test, start) in enumerate(discharges, start=1):
-        data = test["data"]
-        meta = {
-            "cell": cell,
-            "cycle": cycle,
-            "source": NASA_CITATION,
-            "test_id": n,
-            "start_time": start.isoformat(timespec="milliseconds"),
-            "ambient_temperature_C": float(test["ambient_temperature"]),
-        }
-        if np.size(data.get("Capacity", [])) == 1:
-            meta["capacity_Ah"] = float(data["Capacity"])
-        if impedances:
-            nearest = min(impedances, key=lambda entry: abs(entry[0] - start))[1]
-            meta.update(Re_ohm=float(np.real(nearest["Re"])), Rct_ohm=float(np.real(nearest["Rct"])))
-        arrays = {
-            "time_s": data["Time"],
-            "voltage_V": data["Voltage_measured"],
-            "current_A": -np.asarray(data["Current_measured"], dtype=np.float64),
-            "temperature_C": data["Temperature_measured"],
-        }
-        samples.append((arrays, meta))
-    return samples
-
-
-def _start_time(date_vector: FloatArray) -> datetime:
-    year, month, day, hour, minute, second = map(float, date_vector)
-    return datetime(int(year), int(month), int(day)) + timedelta(hours=hour, minutes=minute, seconds=second)

@@ -17,6 +17,7 @@ import pandas as pd
 from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import LOAD_LIMITS
 from battery_env.lab.readers.columns import FileFormat, Recognised, find_columns, say
+from battery_env.lab.readers.nasa import read_nasa_mat
 from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, SOME_SHARE, cells_of, rows_of_cell
 from battery_env.lab.readers.signs import MUCH_SHARE, with_signed_current
 from battery_env.lab.readers.tables import check_mat, open_file, open_frame
@@ -31,7 +32,7 @@ from battery_env.records import (
     drawn,
     is_load,
 )
-from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES, Discharge, read_nasa_mat
+from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES, Discharge
 
 Made = TypeVar("Made")
 

@@ -1,0 +1,63 @@
+"""NASA's own files of battery tests (.mat)."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import loadmat
+
+from battery_env.arrays import FloatArray
+from battery_env.records.discharge import NASA_CITATION
+
+
+def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """The discharges of one of NASA's own files before they are checked."""
+    content: dict[str, Any] = {}
+    try:
+        content = loadmat(path, simplify_cells=True)
+        ((cell, value),) = ((name, value) for name, value in content.items() if isinstance(value, dict) and "cycle" in value)
+        return _samples_of_mat(cell, value)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
+        names = ", ".join(name for name in content if not name.startswith("__"))
+        where = f"one of its variables ({names}) must be a cell with its cycles" if content else repr(error)
+        raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {where}") from error
+
+
+def _samples_of_mat(cell: str, value: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    tests = [(n, test, _start_time(test["time"])) for n, test in enumerate(np.atleast_1d(value["cycle"]))]
+    impedances = [(start, test["data"]) for _, test, start in tests if test["type"] == "impedance"]
+    discharges = [entry for entry in tests if entry[1]["type"] == "discharge"]
+    samples = []
+    for cycle, (n, test, start) in enumerate(discharges, start=1):
+        data = test["data"]
+        meta = {
+            "cell": cell,
+            "cycle": cycle,
+            "source": NASA_CITATION,
+            "test_id": n,
+            "start_time": start.isoformat(timespec="milliseconds"),
+            "ambient_temperature_C": float(test["ambient_temperature"]),
+        }
+        if np.size(data.get("Capacity", [])) == 1:
+            meta["capacity_Ah"] = float(data["Capacity"])
+        if impedances:
+            nearest = min(impedances, key=lambda entry: abs(entry[0] - start))[1]
+            meta.update(Re_ohm=float(np.real(nearest["Re"])), Rct_ohm=float(np.real(nearest["Rct"])))
+        arrays = {
+            "time_s": data["Time"],
+            "voltage_V": data["Voltage_measured"],
+            "current_A": -np.asarray(data["Current_measured"], dtype=np.float64),
+            "temperature_C": data["Temperature_measured"],
+        }
+        samples.append((arrays, meta))
+    return samples
+
+
+def _start_time(date_vector: FloatArray) -> datetime:
+    year, month, day, hour, minute, second = map(float, date_vector)
+    return datetime(int(year), int(month), int(day)) + timedelta(hours=hour, minutes=minute, seconds=second)
