@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from importlib.metadata import version
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, overload
@@ -53,7 +51,7 @@ _LEAST_DT_S = 0.01  # of a discharge that may take a day
 _INDICES = ("load_start", "samples", "first", "stop", "checkpoint_start")
 _PER_TRAJECTORY = ("q_mobile", "r_o", "factors", "equilibrium_V", "eod_time_s", *_INDICES)
 _ARRAYS = (*_PER_TRAJECTORY, "load_values", "checkpoint")
-_SETTINGS = ("load_unit", "dt_s", "thermal", "description")
+_SETTINGS = ("load_unit", "dt_s", "thermal")
 _KIND, _FORMAT = "data set of simulated discharges", 4
 
 
@@ -96,7 +94,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :param dt_s: time step, s
     :param thermal: whether the temperature moves
     :param cell: constants of the cell, as a calibrator may know them
-    :param description: how the data set was made, as JSON may hold it; saved with it
     """
 
     q_mobile: FloatArray
@@ -115,7 +112,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
     dt_s: float
     thermal: bool
     cell: CellParameters
-    description: dict[str, Any]
 
     @staticmethod
     def generate(
@@ -162,9 +158,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         drawn, index = _drawn_loads(loads, n, rng)
         # drawn last, so that all else is the same with and without a mismatch
         factors = np.exp(np.sqrt(np.log1p(mismatch**2)) * rng.standard_normal((n, len(UNCERTAIN_CONSTANTS))))
-        made = TrajectoryDataset.simulated(q, r, drawn, index, dt_s, thermal, cell, factors)
-        asked = {"parameters": list(aged), "n": n, "seed": seed, "mismatch": float(mismatch)}
-        return replace(made, description={"made_by": "generate", **asked})
+        return TrajectoryDataset.simulated(q, r, drawn, index, dt_s, thermal, cell, factors)
 
     @staticmethod
     def along(
@@ -191,10 +185,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
             raise TypeError(f"path must be an AgingPath, got {type(path).__name__}")
         cells = path.draw(n, seed)
         drawn, index = _drawn_loads(loads, n, np.random.default_rng([seed, 1]))
-        made = TrajectoryDataset.simulated(
+        return TrajectoryDataset.simulated(
             cells.q_mobile, cells.r_o, drawn, index, dt_s, thermal, path.cell, cells.factors, cells.equilibrium_V
         )
-        return replace(made, description={"made_by": "along", "n": n, "seed": seed})
 
     @staticmethod
     def simulated(
@@ -254,7 +247,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
             dt_s=dt_s,
             thermal=bool(thermal),
             cell=cell,
-            description={"made_by": "simulated"},
         )
 
     def trimmed(self, low: float, high: float) -> TrajectoryDataset:
@@ -268,7 +260,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
             raise ValueError(f"low and high must be two increasing shares within 0 .. 1, got {low!r} and {high!r}")
         first = np.minimum(np.ceil(low * self.samples).astype(np.int64), self.samples - _LEFT_SAMPLES)
         stop = np.maximum(np.floor(high * self.samples).astype(np.int64), first + _LEFT_SAMPLES)
-        return replace(self, first=first, stop=stop, description={**self.description, "trim": [low, high]})
+        return replace(self, first=first, stop=stop)
 
     @classmethod
     def from_trajectories(cls, trajectories: Sequence[Trajectory]) -> TrajectoryDataset:
@@ -315,7 +307,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
             dt_s=dt_s,
             thermal=thermal,
             cell=cells.pop(),
-            description={"made_by": "from_trajectories"},
         )
 
     @classmethod
@@ -450,13 +441,12 @@ class TrajectoryDataset(Sequence[Trajectory]):
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
-        Save as an npz file (no pickle) that holds the arrays and, as JSON, constants, description and versions.
+        Save as an npz file (no pickle) that holds the arrays and, as JSON, the constants.
 
         :param path: where to; ``.npz`` is added if it is missing
         :raises FileExistsError: if the file exists already
         """
-        versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": version("numba")}
-        settings = {**{name: getattr(self, name) for name in _SETTINGS}, "cell": asdict(self.cell), "versions": versions}
+        settings = {name: getattr(self, name) for name in _SETTINGS} | {"cell": asdict(self.cell)}
         target, metadata = npz_path(path), json.dumps({**settings, "kind": _KIND, "format": _FORMAT})
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
         with replacing(target, new=True) as part:
@@ -475,9 +465,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         if settings["format"] != _FORMAT:
             raise ValueError(f"{path} has format {settings['format']}, this version reads {_FORMAT}: make it again")
         try:
-            constants: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in settings["cell"].items()}
             fields: dict[str, Any] = {name: arrays[name] for name in _ARRAYS} | {name: settings[name] for name in _SETTINGS}
-            dataset = cls(**fields, cell=CellParameters(**constants))
+            dataset = cls(**fields, cell=CellParameters.of_mapping(settings["cell"]))
             _check(dataset)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no valid data set: {error}") from error
@@ -590,10 +579,10 @@ def _starts(lengths: IntArray) -> IntArray:
 def _paper(parameter: str) -> TrajectoryDataset:
     value = np.tile(np.linspace(*PAPER_RANGES[parameter], PAPER_VALUES), len(PAPER_LOADS_W))
     fixed = np.full_like(value, NEW_CELL.r_o if parameter == "q_mobile" else NEW_CELL.q_mobile)
-    made = TrajectoryDataset.simulated(
+    whole = TrajectoryDataset.simulated(
         q_mobile=value if parameter == "q_mobile" else fixed,
         r_o=fixed if parameter == "q_mobile" else value,
         loads=[constant(power) for power in PAPER_LOADS_W],
         load_index=np.repeat(np.arange(len(PAPER_LOADS_W)), PAPER_VALUES),
     )
-    return replace(made.trimmed(*PAPER_TRIM), description={"made_by": "paper", "parameter": parameter})
+    return whole.trimmed(*PAPER_TRIM)
