@@ -55,7 +55,7 @@ def b0005_fit():
     return fit_cell([discharges[0], discharges[84], discharges[-1]])
 
 
-def test_a_fit_tells_how_much_the_cell_holds_before_its_knee_does(b0005_fit):
+def test_a_fit_tells_how_much_the_cell_holds_before_its_knee_does(b0005_fit, monkeypatch):
     q_C = [discharge.q_mobile for discharge in b0005_fit.discharges]
     low_C, high_C = b0005_fit.life_q_mobile_C
     # these ages are of nearly a whole life, a single one in its middle is not
@@ -63,14 +63,16 @@ def test_a_fit_tells_how_much_the_cell_holds_before_its_knee_does(b0005_fit):
     one = dataclasses.replace(b0005_fit, discharges=b0005_fit.discharges[1:2])
     assert one.life_q_mobile_C[0] == pytest.approx(0.7 * q_C[1] / 1.2)
     settings = Settings(cell=b0005_fit)
-    unknown = dataclasses.replace(settings, cell=b0005_fit.cell, cell_rates_sd=b0005_fit.rates_sd)
     for other in load_nasa_discharges("B0006")[40:160:40]:
         start_s, end_s = other.load_on_time_s, other.eod_time_s(2.7)
         seen = other.until(start_s + 0.25 * (end_s - start_s))
         low_s, _, high_s = forecast_end(seen, settings).eod_quantile_s()
         assert low_s < end_s < high_s
-        assert high_s - low_s < 0.8 * np.ptp(forecast_end(seen, unknown).eod_quantile_s())
-        assert calibrate(other, settings).q_mobile_C == calibrate(other, unknown).q_mobile_C
+        q_mobile_C = calibrate(other, settings).q_mobile_C
+        with monkeypatch.context() as patch:
+            patch.setattr(CellFit, "life_q_mobile_C", CellFit.q_mobile_bounds_C)
+            assert high_s - low_s < 0.8 * np.ptp(forecast_end(seen, settings).eod_quantile_s())
+            assert calibrate(other, settings).q_mobile_C == q_mobile_C
     # a prior says more
     known = dataclasses.replace(settings, prior_q_mobile_C=(0.9 * low_C, 0.01 * low_C))
     assert np.median(forecast_end(seen, known).q_mobile) < low_C
