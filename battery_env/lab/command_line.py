@@ -31,7 +31,7 @@ from battery_env.lab.page_server import serve
 from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.readers.testers import find_tester, tester_file
-from battery_env.lab.report import CALIBRATED_BY, line_of, text_of
+from battery_env.lab.report import line_of, text_of
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.lab.sources import Source, find_sources, read_source
 from battery_env.loads import constant
@@ -376,8 +376,6 @@ def _calibrate_all(
         if states.total() > 1:
             counts = ", ".join(f"{states[state]} {state}" for state in ("settled", "not settled", "refused"))
             print(f"\n{states.total()} discharges: {counts}")
-            if settings.method == "policy":
-                print(f"calibrated by {CALIBRATED_BY[settings.method]}")
         elif first and first.found:
             print(text_of(first.record, first.found))
         if results and results.has_numbers:
