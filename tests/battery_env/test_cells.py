@@ -69,26 +69,6 @@ class TestDischarge:
         assert discharge.load_on_time_s == loaded_s[0] - 10.0
         assert discharge.loaded_part(2.0).charge_C == pytest.approx(2.0 * 600.0)
 
-    def test_a_small_load_before_a_larger_one_belongs_to_the_discharge(self):
-        time_s = 10.0 * np.arange(400)
-        current_A = np.where(time_s < 100.0, 0.004, np.where(time_s < 2000.0, 0.15, 2.0))
-        voltage_V = np.linspace(4.19, 3.0, 400)
-        discharge = Discharge(time_s, voltage_V, current_A)
-        assert discharge.load_on_time_s == 95.0
-        assert discharge.loaded_part(2.0).charge_C == pytest.approx(0.15 * 1900.0 + 2.0 * 1995.0, rel=1e-3)
-        # and after it
-        after = Discharge(time_s, voltage_V, current_A[::-1])
-        assert after.loaded_part(2.0).time_s[-1] == time_s[-11]
-
-    @pytest.mark.parametrize(("offset_A", "noise_A"), [(0.01, 0.03), (0.05, 0.0)])
-    def test_noise_and_offset_at_rest_are_no_load(self, offset_A, noise_A):
-        random = np.random.default_rng(0)
-        time_s = np.arange(0.0, 9000.0, 10.0)
-        on = (time_s >= 3600.0) & (time_s < 6600.0)
-        current_A = np.where(on, 2.0, 0.0) + offset_A + noise_A * random.standard_normal(900)
-        discharge = Discharge(time_s, np.linspace(4.19, 3.0, 900), current_A)
-        assert discharge.load_on_time_s == 3595.0 and discharge.loaded_part(2.0).time_s[-1] == 6590.0
-
     def test_end_of_discharge_is_interpolated(self):
         discharge = Discharge(**recorded())
         assert discharge.eod_time_s(2.7) == pytest.approx(47.5)

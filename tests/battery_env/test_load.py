@@ -38,6 +38,12 @@ def test_a_record_without_a_load_has_none():
             load_span(TIME_S, rest_A)
 
 
+@pytest.mark.parametrize(("offset_A", "noise_A"), [(0.01, 0.03), (0.05, 0.0)])
+def test_noise_and_offset_at_rest_are_no_load(offset_A, noise_A):
+    noisy_A = current_A((50, 0.0), (100, 2.0)) + offset_A + noise_A * np.random.default_rng(0).standard_normal(200)
+    assert load_span(TIME_S, noisy_A) == (50, 149)
+
+
 def test_a_drift_is_no_switch():
     assert switches(np.linspace(1.0, 2.0, 200)).tolist() == []
     assert switches(current_A((10, 0.0), (100, 2.0))).tolist() == [9, 109]

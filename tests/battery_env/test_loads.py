@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
-from battery_env import NEW_CELL, Discharge, load_nasa_discharges
+from battery_env import NEW_CELL, load_nasa_discharges
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, RandomWalk, constant, recorded
 from battery_env.records import Samples
 
@@ -79,13 +79,6 @@ def test_a_recorded_load_keeps_charge_and_energy():
             assert load.unit == unit and len(load.value) == steps and load(1e6) == load.value[-1]
             assert dt_s * load.value.sum() == pytest.approx(trapezoid(value, time_s), rel=1e-12)
     assert recorded(part, "power", 1.0).start_s[-1] == int(time_s[-1]) - 1.0
-
-
-def test_a_recorded_load_is_switched_midway_between_the_samples():
-    time_s, current_A = np.array([5.0, 15.0, 25.0, 35.0, 45.0]), np.array([0.0, 0.0, 2.0, 2.0, 1.0])
-    switched = Discharge(time_s, np.full(5, 4.0), current_A)
-    np.testing.assert_allclose(recorded(switched, "current", 1.0)(np.arange(40.0)), np.repeat([0.0, 2.0, 1.0], [15, 20, 5]))
-    np.testing.assert_allclose(recorded(switched, dt_s=10.0).value, [0.0, 4.0, 8.0, 6.0])
 
 
 @pytest.mark.parametrize(
