@@ -152,7 +152,6 @@ def _fit_parser() -> argparse.ArgumentParser:
     group.add_argument(
         "--cut-off", type=float, default=CUT_OFF_V, metavar="V", help="where the discharge ends, V (default: %(default)s)"
     )
-    group.add_argument("--isothermal", action="store_true", help="keep the temperature of the model constant")
     group.add_argument(
         "--out",
         type=Path,
@@ -427,7 +426,7 @@ def _fit(arguments: Sequence[str]) -> int:
     print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
     with warnings.catch_warnings(), saying_that_it_compiles():
         warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
-        found = fit_cell(discharges, options.cut_off, thermal=not options.isothermal)
+        found = fit_cell(discharges, options.cut_off)
     print(found.summary())
     if found.doubt:
         print(f"warning: {found.doubt}", file=sys.stderr)
