@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import Legendre
 
-from battery_env import CellParameters, ExtendedKalmanFilter, LeastSquares, fit_cell, forecast
+from battery_env import CellParameters, Estimate, ExtendedKalmanFilter, LeastSquares, fit_cell, forecast
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
@@ -70,7 +70,7 @@ def test_a_fit_tells_how_much_the_cell_holds_before_its_knee_does(b0005_fit, mon
         assert low_s < end_s < high_s
         q_mobile_C = calibrate(other, settings).q_mobile_C
         with monkeypatch.context() as patch:
-            patch.setattr(CellFit, "life_q_mobile_C", CellFit.q_mobile_bounds_C)
+            patch.setattr(Estimate, "within", lambda estimate, low_C, high_C: estimate)
             assert high_s - low_s < 0.8 * np.ptp(forecast_end(seen, settings).eod_quantile_s())
             assert calibrate(other, settings).q_mobile_C == q_mobile_C
     # a prior says more
