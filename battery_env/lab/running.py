@@ -177,8 +177,9 @@ def files_of(argument: str, folder: Path) -> list[Path]:
 
 def _read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
     """
-    Read the discharges of a cell before the one in progress, up to it where it is among them. All that is named counts as of
-    one cell: of several folders with a warning. What cannot be read is left out with a warning.
+    Read the discharges of a cell before the one in progress, up to it where it is among them, in the order in which they
+    began where each tells, and else in that of the names. All that is named counts as of one cell: of several folders with a
+    warning. What cannot be read is left out with a warning.
     """
     discharges: list[Discharge] = []
     sources = find_sources(arguments)
@@ -204,7 +205,8 @@ def _read_life(arguments: Sequence[str], running: Source, file_format: FileForma
             break  # what follows is the future
     if not discharges:
         raise ValueError(f"{', '.join(arguments)}: no discharge before {running.argument}")
-    return discharges
+    begins = [each.meta.get("start_time") for each in discharges]
+    return sorted(discharges, key=lambda each: each.meta["start_time"]) if all(begins) else discharges
 
 
 def _with_prior(settings: Settings, prior_q_mobile_C: tuple[float, float]) -> Settings:

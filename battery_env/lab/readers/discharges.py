@@ -18,7 +18,7 @@ from battery_env.arrays import BoolArray, FloatArray, IntArray
 from battery_env.checks import LOAD_LIMITS
 from battery_env.lab.readers.columns import FileFormat, Recognised, find_columns, say
 from battery_env.lab.readers.nasa import read_nasa_mat
-from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, SOME_SHARE, cells_of, rows_of_cell
+from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, changes, refuse_other_unit, rows_of
 from battery_env.lab.readers.signs import MUCH_SHARE, with_signed_current
 from battery_env.lab.readers.tables import check_mat, open_file, open_frame
 from battery_env.lab.readers.testers import Tester, find_tester
@@ -32,7 +32,7 @@ from battery_env.records import (
     drawn,
     is_load,
 )
-from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES, Discharge
+from battery_env.records.discharge import LEAST_SAMPLES, Discharge
 
 Made = TypeVar("Made")
 
@@ -43,11 +43,6 @@ _RETURNED_SHARE = 0.2
 # within the load ends the discharge only if it returns more than this share of the largest charge drawn: early pulses return
 # much of the little drawn yet.
 _CHARGED_SHARE = 0.02
-# What errors advise about a unit, a clock, a step and the sign, which helps only where these are not known.
-_UNIT_ADVICE = r" in [^,:]+, not in \w+ \(command line: --units {0}=\w+\)(, and)?"
-_CLOCK_ADVICE = re.compile(r" Give the time in seconds: .*--units time=\w+\)\.")
-_STEP_ADVICE = re.compile(r", or name the column of its step|, and one that does with each step a column of the step")
-_SIGN_ADVICE = re.compile(r": flip the sign.*")
 
 
 class Recording(NamedTuple):
@@ -55,22 +50,19 @@ class Recording(NamedTuple):
 
     arrays: dict[str, Any]  # arguments of Discharge, by name
     meta: dict[str, Any]  # what else is known; without ``cycle`` if the file holds one discharge and does not number it
-    # quantities of known unit, ``step`` if it has a column, ``sign`` if that was told from the data
-    stated: frozenset[str] = frozenset()
+    # advice, by a part of it, that cannot help: to state a unit that is known, or a sign that was told from the data
+    vain: frozenset[str] = frozenset()
 
     def discharge(self) -> Discharge:
-        """Check it; what an error advises is left out where it is known to be otherwise."""
+        """Check it; sentences of an error that advise in vain are left out."""
         if (count := len(self.arrays["time_s"])) < LEAST_SAMPLES:
             raise ValueError(f"{count} rows are no discharge. If each is the end of a step, export all that was recorded.")
         try:
             return Discharge(**self.arrays, meta=self.meta)
         except ValueError as error:
-            text = str(error)
-            for quantity in self.stated:
-                text = re.sub(_UNIT_ADVICE.format(quantity), lambda found: "," if found[1] else "", text)
-            for name, advice in (("time", _CLOCK_ADVICE), ("step", _STEP_ADVICE)):
-                text = advice.sub("", text) if name in self.stated else text
-            raise ValueError(_SIGN_ADVICE.sub(".", text) if "sign" in self.stated else text) from error
+            first, *more = re.split(r"(?<=[^.]\.) (?=[A-Z])", str(error))
+            kept = [each for each in more if not any(part in each for part in self.vain)]
+            raise ValueError(" ".join([first, *kept])) from error
 
 
 def read_discharges(
@@ -186,27 +178,19 @@ def _name_of(source: str | Path | pd.DataFrame) -> str:
 
 
 def _recordings(source: str, table: pd.DataFrame, known: Recognised, file_format: FileFormat) -> list[Recording]:
-    stated = frozenset(quantity for quantity, column in known.columns.items() if column.unit or quantity == "step")
-    stated |= {"sign"} if file_format.discharge_is_negative is None else set()
-    found, reasons = [], []
-    for cell, rows in cells_of(table).items():
-        meta = {"source": source} | ({"cell": cell} if cell else {})
-        try:
-            rows = rows_of_cell(rows, known, file_format)
-            if not file_format.load:  # which is what it says
-                rows = with_signed_current(rows, known, file_format.discharge_is_negative)
-            found += _split(rows, meta, stated)
-        except ValueError as error:
-            reasons.append(f"cell {cell}: {error}" if cell else str(error))
-    if not found:
-        raise ValueError(reasons[0])
-    for reason in reasons:
-        warnings.warn(f"{reason}. It is left out", stacklevel=2)
-    return found
+    vain = {f"--units {quantity}=" for quantity, column in known.columns.items() if column.unit}
+    vain |= {"discharge_is_negative"} if file_format.discharge_is_negative is None else set()
+    try:
+        rows = rows_of(table, known, file_format)
+        if not file_format.load:  # which is what it says
+            rows = with_signed_current(rows, known, file_format.discharge_is_negative)
+        return _split(rows, {"source": source}, frozenset(vain))
+    except ValueError as error:
+        raise known.refusal(error) from error
 
 
-def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> list[Recording]:
-    """The discharges among the rows of one cell; what is left aside is named."""
+def _split(rows: pd.DataFrame, meta: dict[str, Any], vain: frozenset[str]) -> list[Recording]:
+    """The discharges among some rows; what is left aside is named."""
     bounds = _bounds(rows)
     parts = [part for low, high in itertools.pairwise(bounds) for part in _discharges(rows, low, high)]
     if not parts:
@@ -230,9 +214,9 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], stated: frozenset[str]) -> 
     several = len(stretches) > 1
     found = []
     for number, stretch in enumerate(stretches, start=1):
-        history = ChargeHistory(charge=_charge_before(rows, not_charging, stretch.start), load_on_s=_load_on_s(rows, stretch))
+        history = ChargeHistory(charge=_charge_before(rows, not_charging, stretch.start))
         numbered = meta | ({"cycle": number} if several else {})
-        found.append(_recording(rows.iloc[stretch], history, numbered, several, stated))
+        found.append(_recording(rows.iloc[stretch], history, numbered, several, vain))
     return found
 
 
@@ -250,53 +234,32 @@ def _say_left_aside(rows: pd.DataFrame, parts: list[tuple[slice, float]], which:
 
 def _bounds(rows: pd.DataFrame) -> list[int]:
     """
-    Where the number of the cycle changes, but not where that parts a rest from its load, or a discharge whose voltage goes on:
-    counters may count loops, or go up where the load is switched on.
+    Where the number of the cycle changes, and a charge follows, a clock starts anew, or a current that no cell can draw begins
+    or ends; or where no charge is logged, and the voltage is back after it fell: counters may count loops.
     """
     if "cycle" not in rows:
         return [0, len(rows)]
     time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
-    # a cycle may draw little beside others
-    most_A = rows["current"].abs().groupby(rows["cycle"]).transform("max").to_numpy()
-    load_A = LOAD_SHARE * np.maximum(most_A, min(REST_CURRENT_A / LOAD_SHARE, most_A.max()))
-    lowest_V = voltage_V.min()
-    charged = np.zeros(len(rows), dtype=np.bool_)
+    begin = np.flatnonzero(changes(rows, "cycle") | (np.arange(len(rows)) == 0))
+    highest_V, lowest_V = np.maximum.reduceat(voltage_V, begin), np.minimum.reduceat(voltage_V, begin)
+    most_A = np.maximum.reduceat(np.abs(current_A), begin)
+    is_wrong = most_A > LOAD_LIMITS["current"]
+    # of loads and charges, the last and the next one; a cycle may draw little beside others
+    load_A = np.maximum(LOAD_SHARE * most_A, min(REST_CURRENT_A, LOAD_SHARE * most_A.max()))
+    towards = np.where(current_A > np.repeat(load_A, np.diff([*begin, len(rows)])), 1.0, np.nan)
     for start, end, _, is_braking in _charges(current_A, _passed_C(time_s, current_A)):
-        charged[start:end] = not is_braking and (current_A[start:end] < -load_A[start:end]).any()
-    n = np.arange(len(rows))
-    loads = charged | (current_A > load_A)
-    # of each row the last one under load or charge before it, the next one from it on, and the last one of a charge
-    before = np.maximum.accumulate(np.append(-1, np.where(loads, n, -1)[:-1]))
-    after = np.minimum.accumulate(np.where(loads, n, len(rows))[::-1])[::-1]
-    last_charge = np.maximum.accumulate(np.where(charged, n, -1))
-    bounds, since = [0], _Range(voltage_V)
-    changes = (np.flatnonzero(np.diff(rows["cycle"])) + 1).tolist()
-    for n, following in itertools.pairwise([*changes, len(rows)]):
-        if time_s[n] < time_s[n - 1] or (after[n] < len(rows) and charged[after[n]]):
-            bounds.append(n)
-        elif after[n] < len(rows) and (before[n] < 0 or charged[before[n]]):
-            # a rest that is all in the cycle before belongs to the load
-            bounds.append(n if after[n] > n else int(before[n]) + 1)
-        elif after[n] < len(rows):
-            low_V, top_V = since.of(max(bounds[-1], int(last_charge[n]) + 1), n)
-            is_back = top_V - voltage_V[n : min(after[n] + 1, following)].max() < MUCH_SHARE * (top_V - low_V)
-            if is_back and top_V - low_V > MUCH_SHARE * (top_V - lowest_V):
-                bounds.append(n)
-    return [*sorted({*bounds}), len(rows)]
-
-
-class _Range:
-    """The lowest and the highest of values from one row to another, of rows that only go on: each is looked at once."""
-
-    def __init__(self, values: FloatArray) -> None:
-        self.values, self.low, self.high, self.found = values, -1, -1, (0.0, 0.0)
-
-    def of(self, low: int, high: int) -> tuple[float, float]:
-        part = self.values[low:high] if low != self.low else self.values[self.high : high]
-        least, most = float(part.min(initial=np.inf)), float(part.max(initial=-np.inf))
-        self.found = (least, most) if low != self.low else (min(least, self.found[0]), max(most, self.found[1]))
-        self.low, self.high = low, high
-        return self.found
+        towards[start:end] = np.nan if is_braking else -1.0
+    before, after = pd.Series(towards).ffill().to_numpy(), pd.Series(towards).bfill().to_numpy()
+    bounds, top_V, low_V = [0], highest_V[0], lowest_V[0]
+    for n, row in enumerate(begin[1:], start=1):
+        is_back = top_V - highest_V[n] < MUCH_SHARE * (top_V - low_V) and top_V - low_V > MUCH_SHARE * np.ptp(voltage_V)
+        is_other = time_s[row] < time_s[row - 1] or is_wrong[n] != is_wrong[n - 1] or after[row] < 0.0
+        if is_other or (is_back and before[row - 1] > 0.0 and after[row] > 0.0):
+            bounds.append(int(row))
+            top_V, low_V = highest_V[n], lowest_V[n]
+        else:
+            top_V, low_V = max(top_V, highest_V[n]), min(low_V, lowest_V[n])
+    return [*bounds, len(rows)]
 
 
 def _passed_C(time_s: FloatArray, current_A: FloatArray) -> FloatArray:
@@ -338,38 +301,10 @@ def _charge_before(rows: pd.DataFrame, not_charging: IntArray, begin: int) -> Ch
     return ChargeBefore.of(time_s, voltage_V, current_A)
 
 
-def _load_on_s(rows: pd.DataFrame, stretch: slice) -> float | None:
-    """When the load of a discharge came on, if its first row says how long ago that was, or how much was drawn since."""
-    time_s, current_A = (rows[name].to_numpy() for name in ("time", "current"))
-    n = stretch.start + int(is_load(current_A[stretch]).argmax())
-    if not 0 < n < len(rows) - 1:
-        return None
-    interval_s, ago_s, teller = time_s[n] - time_s[n - 1], np.inf, ""
-    if "capacity" in rows:
-        (on_C, next_C), now_C = np.diff(rows["capacity"].iloc[n - 1 : n + 2]), rows["capacity"].iloc[n]
-        if abs(abs(next_C) / current_A[n] - (time_s[n + 1] - time_s[n])) <= SOME_SHARE * (time_s[n + 1] - time_s[n]):
-            # a counter may start anew with each step
-            ago_s, teller = abs(on_C if on_C * next_C >= 0.0 else now_C) / current_A[n], "the count of the tester"
-    if "step_time" in rows:
-        step_s, later_s = rows["step_time"].iloc[n : n + 2]
-        ago_s, teller = (step_s, "the time in its step") if 0.0 <= step_s < later_s else (ago_s, teller)
-    # the two clocks need not agree to the last digit, nor a count of few digits
-    if not ago_s <= (1.0 + SOME_SHARE) * interval_s:
-        return None
-    told_s = max(float(time_s[n] - ago_s), float(time_s[n - 1]))
-    if interval_s > 2.0 * max(time_s[n + 1] - time_s[n], time_s[n - 1] - time_s[max(n - 2, 0)]):
-        warnings.warn(
-            f"the load came on {time_s[n] - told_s:g} s before row {rows.index[n] + 1}, as {teller} says", stacklevel=2
-        )
-    return told_s
-
-
 def _recording(
-    rows: pd.DataFrame, history: ChargeHistory, meta: dict[str, Any], has_own_clock: bool, stated: frozenset[str]
+    rows: pd.DataFrame, history: ChargeHistory, meta: dict[str, Any], has_own_clock: bool, vain: frozenset[str]
 ) -> Recording:
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
-    if has_own_clock and history.load_on_s is not None:
-        history = history._replace(load_on_s=history.load_on_s - float(time_s[0]))
     if "cycle" in rows:
         meta["cycle"] = int(rows["cycle"].iloc[int(is_load(current_A).argmax())])
     # dates of this century are more than a billion seconds after 1970, and a clock is none
@@ -382,26 +317,21 @@ def _recording(
         "time_s": time_s - time_s[0] if has_own_clock else time_s,
         "voltage_V": rows["voltage"].to_numpy(),
         "current_A": current_A,
+        "history": _with_count(history, rows, vain) if "capacity" in rows else history,
     }
-    if "temperature" in rows:
-        temperature_C = _filled(time_s, rows["temperature"].to_numpy())
-        if temperature_C is not None:
-            arrays["temperature_C"] = temperature_C
-    arrays["history"] = _with_count(history, rows, stated)
-    return Recording(arrays, meta, stated)
+    if "temperature" in rows and not rows["temperature"].isna().all():
+        temperature_C = rows.set_index("time")["temperature"].interpolate(method="index", limit_direction="both")
+        arrays["temperature_C"] = temperature_C.to_numpy()
+    return Recording(arrays, meta, vain)
 
 
-def _with_count(history: ChargeHistory, rows: pd.DataFrame, stated: frozenset[str]) -> ChargeHistory:
-    """With how much the charge under load is another one than the tester counted row by row, or than a clock lost."""
+def _with_count(history: ChargeHistory, rows: pd.DataFrame, vain: frozenset[str]) -> ChargeHistory:
+    """With how much the charge under load is another one than the tester counted row by row."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(is_load(current_A))
-    if not len(loaded):  # of values that no cell has, which are refused later
+    if len(loaded) < LEAST_SAMPLES:  # of values that no cell has, which are refused later
         return history
     part = slice(loaded[0], loaded[-1] + 1)
-    if "lost" in rows:  # all of it in each step of the program, none, or any part in all alike
-        history = history._replace(uncounted_C=float(rows["lost"].to_numpy()[part][1:].sum()) / 3.0**0.5)
-    if "capacity" not in rows or len(loaded) < LEAST_SAMPLES:
-        return history
     step_C = np.diff(rows["capacity"].to_numpy()[part])
     step_C = step_C if (step_C > 0.0).sum() > (step_C < 0.0).sum() else -step_C  # a counter may count down
     if (step_C > 0.0).mean() < 0.5:
@@ -417,9 +347,8 @@ def _with_count(history: ChargeHistory, rows: pd.DataFrame, stated: frozenset[st
     if abs(off_C) > FEW_SHARE * counted_C:
         counted_Ah, passed_Ah = counted_C / 3600.0, (counted_C + off_C) / 3600.0
         told = f"the tester counted {counted_Ah:.4g} Ah, where current and time make {passed_Ah:.4g} Ah"
-        for unit, (symbol, tick_s) in CLOCKS.items() if "time" not in stated else ():
-            if tick_s != 1.0 and abs(counted_Ah / passed_Ah - tick_s) <= SOME_SHARE * tick_s:
-                raise ValueError(f"{told}, as if the clock counts {unit}: --units time={symbol}")
+        if "--units time=" not in vain:
+            refuse_other_unit(counted_Ah, passed_Ah, told)
         say(f"{told}: check units and clock, and that all rows are there")
     return history._replace(is_counted=is_counted, uncounted_C=abs(off_C))
 
@@ -444,16 +373,3 @@ def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int
         if passed_C[end - 1] < lowest_C:
             lowest_C = highest_C = passed_C[end - 1]
     return found
-
-
-def _filled(time_s: FloatArray, temperature_C: FloatArray) -> FloatArray | None:
-    """The temperature at all samples, where some of them have none; nothing where all have none."""
-    known = ~np.isnan(temperature_C)
-    if known.all():
-        return temperature_C
-    if not known.any():
-        return None
-    gap_s = float(np.diff([time_s[0], *time_s[known], time_s[-1]]).max())
-    if gap_s > SOME_SHARE * np.ptp(time_s):
-        warnings.warn(f"the temperature is missing for up to {gap_s:.0f} s, and interpolated", stacklevel=2)
-    return np.interp(time_s, time_s[known], temperature_C[known])

@@ -6,7 +6,6 @@ import bz2
 import csv
 import gzip
 import io
-import itertools
 import lzma
 import re
 import warnings
@@ -23,7 +22,7 @@ import numpy as np
 import pandas as pd
 
 from battery_env.files import LARGEST_UNPACKED_BYTES
-from battery_env.lab.readers.columns import FileFormat, Recognised, are_units, count_required, has, say
+from battery_env.lab.readers.columns import FileFormat, Recognised, are_units, count_required, say
 from battery_env.lab.readers.testers import ENCODINGS, REQUIRED
 
 #: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
@@ -34,38 +33,19 @@ BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr", ".xlsx", ".xls")
 PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zip")
 
 _OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
-# Testers write what they know about a test above the table: its header is searched in so many bytes and lines. A table is
-# known by so many of its rows.
-_HEAD_BYTES, _HEAD_LINES, _FIRST_ROWS = 1 << 18, 2000, 400
+# Testers write what they know about a test above the table: its header is searched in so many lines of so many bytes each. A
+# table is known by so many of its rows.
+_HEAD_LINES, _LINE_BYTES, _FIRST_ROWS = 2000, 128, 400
 # A small file has no more rows and columns, so that all that is made of it fits into 1 GB; a large one a row each 20 bytes.
 _MOST_ROWS, _LEAST_ROW_BYTES, _MOST_COLUMNS = 3_000_000, 20, 2000
 _BLANKS = r"\s+"
 _DELIMITERS = (",", ";", "\t", "|", _BLANKS)
 _ITS_COMMA = re.compile(r"^(\s*[-+]?\d*),(?=\d)")
 _DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
-_DECIMAL_POINT = re.compile(r"^\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*$")
-_NUMBER = re.compile(r"^\s*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
-# What Excel reads in the first line of a file: the delimiter.
-_DELIMITER_LINE = re.compile(r"^\s*sep=([,;\t|])\s*$", flags=re.IGNORECASE)
-# Some testers put lines as a whole in quotes.
-_QUOTED_LINES = re.compile(rb'^"([^"\n]*)"\s*$', flags=re.MULTILINE)
-# What pandas says of quotes that are open at the end of a file.
-_OPEN_QUOTES = re.compile(r"EOF inside string starting at row (\d+)")
+_NUMBER = re.compile(r"^\s*[-+]?\d*\.?\d+\.?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
 # How workbooks begin; text is called .xls by some testers.
 _WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 _EXPORT = {".res": "export the channel as CSV in MITS Pro", ".h5": "export the records as CSV"}
-
-
-class Layout(NamedTuple):
-    """How a text file is laid out."""
-
-    encoding: str
-    header_line: int
-    delimiter: str
-    decimal: str
-    names: list[str]
-    layers: int  # so many columns at the left number what lies above a row, as its cycle and its step
-    rows: list[list[str]]  # fields of the first lines below the header
 
 
 class TooLargeError(ValueError):
@@ -91,9 +71,10 @@ def open_file(path: Path, file_format: FileFormat) -> Opened:
         return _open_parquet(path)
     if suffix in (".nda", ".ndax", ".mpr"):
         return open_frame(_read_biologic(path) if suffix == ".mpr" else _read_neware(path))
-    content = _text_of(path, file_format)
-    layout = _layout_of(content[:_HEAD_BYTES], file_format)
-    return Opened(layout.names, layout.rows, lambda found: _read_text(content, layout, found))
+    content = _content(path)
+    if suffix in (".xlsx", ".xls") and content.startswith(_WORKBOOKS):
+        return open_frame(_sheet(path, file_format))
+    return _open_text(_text_of(content), file_format)
 
 
 def open_frame(table: pd.DataFrame) -> Opened:
@@ -111,78 +92,17 @@ def _first_rows(table: pd.DataFrame) -> list[list[str]]:
     return [[str(value) for value in row] for row in first.where(first.notna(), "").to_numpy()]
 
 
-def _text_of(path: Path, file_format: FileFormat) -> bytes:
-    """The content of a text file, unpacked, or of a workbook as text, without what is no character."""
-    content = _content(path)
-    if path.suffix.lower() in (".xlsx", ".xls") and content.startswith(_WORKBOOKS):
-        return _sheet(path, file_format)
-    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        content = content.decode("utf-16", errors="ignore").encode()
-    kept = content.rstrip(b"\0")  # what a power cut leaves of the end
-    if 10 * kept.count(b"\0") > len(kept):
-        raise ValueError("the file is binary, and its ending is none of those that can be read")
-    kept = kept.replace(b"\0", b"")
-    if len(kept) < len(content):
-        say(f"{len(content) - len(kept)} NUL bytes, which are no text, are left out")
-    head = kept[:_HEAD_BYTES]
-    if b"\n" not in head:  # lines may end as on old computers, too
-        kept = kept.replace(b"\r", b"\n")
-    if _QUOTED_LINES.search(head):
-        kept = _QUOTED_LINES.sub(rb"\1", kept)
-    _check_rows(kept.count(b"\n"), len(kept))  # those of old computers, too
-    return kept.replace("\u2212".encode(), b"-")  # the sign of typographers
+def _check(count: int, most: int, what: str) -> None:
+    if count > most:
+        raise TooLargeError(f"{count} {what} are more than the {most} that are read: cut it in parts, or unpack it by hand")
 
 
 def _check_rows(count: int, size: int) -> None:
-    if count > max(_MOST_ROWS, size // _LEAST_ROW_BYTES):
-        raise TooLargeError(
-            f"{count} rows are more than the {_MOST_ROWS} that are read of a file of {size} bytes: cut it in parts"
-        )
+    _check(count, max(_MOST_ROWS, size // _LEAST_ROW_BYTES), "rows")
 
 
 def _check_unpacked(count: int) -> None:
-    if count > LARGEST_UNPACKED_BYTES:
-        raise TooLargeError(
-            f"unpacked it has more than the {LARGEST_UNPACKED_BYTES >> 20} MiB that are read: unpack it by hand"
-        )
-
-
-def _read_text(content: bytes, layout: Layout, found: Recognised) -> pd.DataFrame:
-    _check_width(layout)
-    has_units = bool(layout.rows) and are_units(layout.rows[0])
-    width = max(map(len, layout.rows[has_units:]), default=0)
-    if not width:
-        raise ValueError("there are no rows below the header")
-    # one column may serve as two quantities
-    positions = sorted({*range(layout.layers), *(each.position for each in found.columns.values())})
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of columns that are text in parts, which is seen later
-            table = pd.read_csv(
-                io.BytesIO(content),
-                sep=layout.delimiter,
-                decimal=layout.decimal,
-                encoding=layout.encoding,
-                encoding_errors="replace",  # of remarks; what is no number is seen later
-                header=None,
-                names=range(width),
-                skiprows=layout.header_line + 1 + has_units,
-                usecols=[n for n in positions if n < width],
-                index_col=False,
-                na_values=[*found.tester.missing],
-            )
-    except Exception as error:  # pandas raises whatever the damage leads it to
-        kept, _, last = content.rstrip().rpartition(b"\n")
-        if not (quotes := _OPEN_QUOTES.search(str(error))):
-            raise found.refusal(f"the file is damaged, or no table: {str(error).strip()}") from error
-        if last.count(b'"') % 2 == 0:
-            raise found.refusal(f"the quotes that begin in row {int(quotes[1]) + 1} do not end") from error
-        say("the last line is cut within quotes, and left out")
-        return _read_text(kept, layout, found)
-    if layout.decimal == ",":  # words among numbers make text of all
-        table = table.replace(_ITS_COMMA, r"\1.", regex=True)
-    table = _lowest_layer(table.reindex(columns=positions), layout.layers)
-    return pd.DataFrame({key: table[column.position] for key, column in found.columns.items()})
+    _check(count, LARGEST_UNPACKED_BYTES, "bytes unpacked")
 
 
 def _content(path: Path) -> bytes:
@@ -193,7 +113,7 @@ def _content(path: Path) -> bytes:
             while part := stream.read(1 << 20):
                 parts.append(part)
                 count += len(part)
-                lines += part.count(b"\n")
+                lines += max(part.count(b"\n"), part.count(b"\r"))  # as on old computers, too
                 _check_rows(lines, count)
                 if path.suffix.lower() in PACKED_SUFFIXES:
                     _check_unpacked(count)
@@ -219,10 +139,9 @@ def _check_archive(path: Path) -> None:
     """Refuse a file that holds an archive of what is far larger, by what the archive says of itself."""
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            for each in archive.infolist():
-                # of a text that many cells share each is kept
-                _check_unpacked(each.file_size * (8 if each.filename.endswith("sharedStrings.xml") else 1))
-            _check_unpacked(sum(each.file_size for each in archive.infolist()))
+            # of a text that many cells share each is kept
+            sizes = [each.file_size * (8 if "sharedStrings" in each.filename else 1) for each in archive.infolist()]
+        _check_unpacked(sum(sizes))
 
 
 def check_mat(path: Path) -> None:
@@ -239,74 +158,94 @@ def check_mat(path: Path) -> None:
                     count += len(unpacker.decompress(part))
                 except zlib.error:
                     return  # which what reads it says
-                # numbers may be written in one byte that take eight in memory
-                _check_unpacked(8 * count)
+                _check_unpacked(8 * count)  # numbers may be written in one byte that take eight in memory
             stream.seek(end)
 
 
-def _lowest_layer(table: pd.DataFrame, layers: int) -> pd.DataFrame:
-    """The rows of which no layer above has a number, each with the numbers that were given last."""
-    if not layers:
-        return table
-    numbers = list(range(layers))
-    above = table[numbers].notna().any(axis=1)
-    table[numbers] = table[numbers].ffill()
-    return table[~above]
+def _text_of(content: bytes) -> bytes:
+    """A text without what is no character."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        content = content.decode("utf-16", errors="ignore").encode()
+    kept = content.rstrip(b"\0")  # what a power cut leaves of the end
+    if 10 * kept.count(b"\0") > len(kept):
+        raise ValueError("the file is binary, and its ending is none of those that can be read")
+    kept = kept.replace(b"\0", b"")
+    if len(kept) < len(content):
+        say(f"{len(content) - len(kept)} NUL bytes, which are no text, are left out")
+    if b"\n" not in kept[: _HEAD_LINES * _LINE_BYTES]:  # lines may end as on old computers, too
+        kept = kept.replace(b"\r", b"\n")
+    return kept.replace("\u2212".encode(), b"-")  # the sign of typographers
 
 
-def _layout_of(head: bytes, file_format: FileFormat) -> Layout:
-    """The layout of a text by its beginning; the first encoding is taken in which it has the names of a record."""
-    encodings = [file_format.tester.encoding] if file_format.tester and file_format.tester.encoding else ["utf-8", *ENCODINGS]
-    layouts = []
-    for encoding in encodings:
+def _open_text(content: bytes, file_format: FileFormat) -> Opened:
+    """The first encoding is taken in which the beginning of a text has the names of a record."""
+    stated = file_format.tester and file_format.tester.encoding
+    opened = []
+    for encoding in [stated] if stated else ["utf-8", *ENCODINGS]:
         try:
             # the head may end within a character
-            text = getincrementaldecoder(encoding)().decode(head, final=False).removeprefix("\ufeff")
+            head = getincrementaldecoder(encoding)().decode(content[: _HEAD_LINES * _LINE_BYTES], final=False)
         except LookupError as error:
             raise ValueError(f"the encoding {encoding!r} is not known") from error
         except UnicodeDecodeError:
             continue
-        layouts.append(_layout(text, encoding, file_format))
-        if encoding == "utf-8" or count_required(layouts[-1].names, file_format) == len(REQUIRED):
-            return layouts[-1]
-    if not layouts:
-        raise ValueError(f"the file is no text in {encodings[0]}")
-    return layouts[0]
+        opened.append(_open_as(content, head.removeprefix("\ufeff"), encoding, file_format))
+        if encoding == "utf-8" or count_required(opened[-1].names, file_format) == len(REQUIRED):
+            return opened[-1]
+    if not opened:
+        raise ValueError(f"the file is no text in {stated}")
+    return opened[0]
 
 
-def _layout(text: str, encoding: str, file_format: FileFormat) -> Layout:
-    lines = io.StringIO(text, newline=None).read().split("\n")[: _HEAD_LINES + _FIRST_ROWS]
-    delimiters: tuple[str, ...] = _DELIMITERS
-    if stated := _DELIMITER_LINE.match(lines[0]):
-        lines[0], delimiters = "", (stated[1],)
-    filled = [number for number, line in enumerate(lines) if line.strip()]
-    below = {number: lines[after] for number, after in itertools.pairwise(filled)}
-    tables = {each: [_fields(line, below.get(number, ""), each) for number, line in enumerate(lines)] for each in delimiters}
+def _open_as(content: bytes, head: str, encoding: str, file_format: FileFormat) -> Opened:
+    lines = io.StringIO(head, newline=None).read().split("\n")[: _HEAD_LINES + _FIRST_ROWS]
+    tables = {delimiter: [_fields(line, delimiter) for line in lines] for delimiter in _DELIMITERS}
     delimiter, number = _find_header(tables, file_format)
-    table = tables[delimiter]
-    above, names, rows = table[:number], [*table[number]], table[number + 1 :][:_FIRST_ROWS]
-    if len(names) > _MOST_COLUMNS:
-        raise ValueError(f"{len(names)} columns are more than the {_MOST_COLUMNS} that are read")
-    layers = next((n for n, name in enumerate(names) if name), 0)
-    is_above = [any(row[:layers]) for row in rows if any(row)]
-    if 2 * sum(is_above) >= len(is_above):
-        layers = 0
-    for n in range(layers):
-        names[n] = next((row[n] for row in reversed(above) if any(row[n : n + 1])), "")
-    values = [field for row in rows for field in row]
-    commas, points = (sum(map(bool, map(mark.match, values))) for mark in (_DECIMAL_COMMA, _DECIMAL_POINT))
-    return Layout(encoding, number, delimiter, "," if commas > points and delimiter != _BLANKS else ".", names, layers, rows)
-
-
-def _check_width(layout: Layout) -> None:
-    """Refuse rows of more numbers than names, as nothing tells what is what; remarks behind them change nothing."""
-    rows, width = [row for row in layout.rows if any(row)], len(layout.names)
-    wider = [row for row in rows if any(row[width:])]
-    if 2 * len(wider) > len(rows) and any(_count_numbers(row[width:]) for row in wider):
+    names, rows = tables[delimiter][number], tables[delimiter][number + 1 :][:_FIRST_ROWS]
+    _check(len(names), _MOST_COLUMNS, "columns")
+    has_units = bool(rows) and are_units(rows[0])
+    values = [row for row in rows[has_units:] if any(row)]
+    if not values:
+        raise ValueError("there are no rows below the header")
+    if not names[0] and 0 < 2 * sum(row[0] != "" for row in values) < len(values):
+        raise ValueError("rows of cycles, steps and records are in one table: export the records alone")
+    wider = [len(row) for row in values if any(row[len(names) :])]
+    if 2 * len(wider) > len(values):
         raise ValueError(
-            f"rows have {len(wider[0])} fields below {width} names, which does not tell what is what: name each column, and "
+            f"rows have {wider[0]} fields below {len(names)} names, which does not tell what is what: name each column, and "
             "take another delimiter than the decimal comma"
         )
+    commas = sum(bool(_DECIMAL_COMMA.match(field)) for row in values for field in row)
+    options: dict[str, Any] = {
+        "sep": delimiter,
+        "decimal": "," if commas > len(values) / 2 and delimiter != _BLANKS else ".",
+        "encoding": encoding,
+        "skiprows": number + 1 + has_units,
+        "names": range(max(map(len, values))),
+    }
+    return Opened(names, rows, lambda found: _read_text(content, options, found))
+
+
+def _read_text(content: bytes, options: dict[str, Any], found: Recognised) -> pd.DataFrame:
+    positions = sorted({column.position for column in found.columns.values()})  # one may serve as two quantities
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of columns that are text in parts, which is seen later
+            table = pd.read_csv(
+                io.BytesIO(content),
+                encoding_errors="replace",  # of remarks; what is no number is seen later
+                header=None,
+                usecols=[n for n in positions if n in options["names"]],
+                index_col=False,
+                na_values=[*found.tester.missing],
+                **options,
+            )
+    except Exception as error:  # pandas raises whatever the damage leads it to
+        raise found.refusal(f"the file is damaged, or no table: {str(error).strip()}") from error
+    table = table.reindex(columns=positions)
+    if options["decimal"] == ",":  # words among numbers make text of all
+        table = table.replace(_ITS_COMMA, r"\1.", regex=True)
+    return pd.DataFrame({key: table[column.position] for key, column in found.columns.items()})
 
 
 class _Header(NamedTuple):
@@ -321,11 +260,11 @@ class _Header(NamedTuple):
 def _find_header(tables: Mapping[str, Sequence[Sequence[str]]], file_format: FileFormat) -> tuple[str, int]:
     """In which of some tables, by delimiter or by sheet, and in which of its rows the names of the columns are."""
     candidates: dict[tuple[str, ...], _Header] = {}  # by names, which may come again
-    numbers: Sequence[str] = ()
+    has_numbers = False
     for key, rows in tables.items():
-        counts = [_count_numbers(row) for row in rows]
+        counts = [sum(bool(_NUMBER.match(field) or _DECIMAL_COMMA.match(field)) for field in row) for row in rows]
         is_row = np.array(counts) > 1
-        numbers = numbers or next((rows[n] for n in np.flatnonzero(is_row).tolist()), ())
+        has_numbers |= bool(is_row.any())
         # a delimiter may end each
         widths = np.array([(len(row), len([*filter(None, row)])) for row in rows]).reshape(-1, 2)
         for n in [n for n, row in enumerate(rows[:_HEAD_LINES]) if any(row) and not counts[n]]:
@@ -334,11 +273,8 @@ def _find_header(tables: Mapping[str, Sequence[Sequence[str]]], file_format: Fil
             found = _Header(count_required(rows[n], file_format), fits, n if fits else -n, key)
             candidates.setdefault(tuple(filter(None, rows[n])), found)
     best = max(candidates.values(), key=lambda each: each[:3], default=_Header(0, 0, 0, ""))
-    if numbers and not (best.quantities or best.fits):
-        raise ValueError(
-            "there is no line with the names of the columns above the numbers. Add one. The first line of numbers: "
-            f"{', '.join(numbers)[:99]}"
-        )
+    if has_numbers and not (best.quantities or best.fits):
+        raise ValueError("there is no line with the names of the columns above the numbers. Add one")
     if not candidates:
         raise ValueError("the file is empty")
     first = next(each for each in candidates.values() if each.quantities == best.quantities)
@@ -347,21 +283,13 @@ def _find_header(tables: Mapping[str, Sequence[Sequence[str]]], file_format: Fil
     return best.table, abs(best.nearness)
 
 
-def _count_numbers(fields: Sequence[str]) -> int:
-    return sum(bool(_NUMBER.match(field) or _DECIMAL_COMMA.match(field)) for field in fields)
-
-
-def _fields(line: str, next_line: str, delimiter: str) -> list[str]:
-    # numpy writes a header as a comment
-    line = line.lstrip("# ")
-    if delimiter == _BLANKS:
-        fields, below = (each.replace('"', " ").split() for each in (line, next_line))
-        # of which two or more part names of several words
-        return fields if len(fields) <= len(below) else re.split(r"\s{2,}", line.strip())
+def _fields(line: str, delimiter: str) -> list[str]:
+    line = line.lstrip("# ")  # numpy writes a header as a comment
     try:
-        return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
+        fields = line.split() if delimiter == _BLANKS else next(csv.reader([line], delimiter=delimiter), [])
     except csv.Error:
         return []
+    return [field.strip().strip('"') for field in fields]
 
 
 @contextmanager
@@ -381,61 +309,44 @@ def _reading(kind: str, extra: str) -> Iterator[None]:
         raise ValueError(f"the file is damaged, or no {kind} file: {str(error).strip()}") from error
 
 
-def _sheets(path: Path) -> Iterator[tuple[str, Iterable[Sequence[Any]]]]:
-    """Each sheet's title and its rows, as wide as they are filled: a single cell may lie in the last corner of a sheet."""
-    if path.read_bytes()[:4] == _WORKBOOKS[0]:
+def _sheets(path: Path) -> dict[str, list[list[str]]]:
+    """The rows of each sheet, as wide as they are filled: a single cell may lie in the last corner of a sheet."""
+    with _reading("Excel", "excel"):
+        if path.read_bytes()[:4] != _WORKBOOKS[0]:
+            tables = pd.read_excel(path, sheet_name=None, header=None, engine="xlrd")
+            return {str(title): _rows_of_sheet(title, table.to_numpy()) for title, table in tables.items()}
         import openpyxl
 
         with closing(openpyxl.load_workbook(path, read_only=True, data_only=True)) as book:
             for sheet in book.worksheets:
                 sheet.reset_dimensions()
-                yield sheet.title, sheet.iter_rows(values_only=True)
-    else:
-        import xlrd
-
-        with xlrd.open_workbook(path, ragged_rows=True, on_demand=True) as book:
-            for sheet in book.sheets():
-                yield sheet.name, ([_cell_of_xls(cell, book.datemode) for cell in row] for row in sheet.get_rows())
+            return {sheet.title: _rows_of_sheet(sheet.title, sheet.iter_rows(values_only=True)) for sheet in book.worksheets}
 
 
-def _cell_of_xls(cell: Any, datemode: int) -> Any:
-    import xlrd
-
-    return xlrd.xldate_as_datetime(cell.value, datemode) if cell.ctype == xlrd.XL_CELL_DATE else cell.value
-
-
-def _sheet(path: Path, file_format: FileFormat) -> bytes:
-    """The sheet of a workbook that holds the record, and those that continue it, as text."""
-    with _reading("Excel", "excel"):
-        sheets = {title: _rows_of_sheet(title, rows) for title, rows in _sheets(path)}
-    title, line = _find_header({each: rows[: _HEAD_LINES + _FIRST_ROWS] for each, rows in sheets.items()}, file_format)
-    header = sheets[title][line]
-    parts = [rows[rows.index(header) + 1 :] for rows in sheets.values() if header in rows[:_HEAD_LINES]]
-    # each may be a test of its own
-    numbered = len(parts) > 1 and not has("cycle", header)
-    text = io.StringIO()
-    writer, width = csv.writer(text, lineterminator="\n"), len(header)
-    writer.writerows([*sheets[title][:line], [*header, *["Cycle"] * numbered]])
-    for number, rows in enumerate(parts, start=1):
-        writer.writerows([*row[:width], *[""] * (width - len(row)), *[number] * numbered] for row in rows)
-    return text.getvalue().encode()
-
-
-def _rows_of_sheet(title: str, rows: Iterable[Sequence[Any]]) -> list[list[str]]:
+def _rows_of_sheet(title: object, rows: Iterable[Sequence[Any]]) -> list[list[str]]:
     """The rows of a sheet that are filled; refused where it is too large."""
     kept: list[list[str]] = []
     size = 0
     for row in rows:
-        fields = ["" if value is None else " ".join(str(value).split()) for value in row]
+        fields = ["" if value is None or value != value else " ".join(str(value).split()) for value in row]
         while fields and not fields[-1]:
             fields.pop()
-        if len(fields) > _MOST_COLUMNS:
-            raise TooLargeError(f"{len(fields)} columns in sheet {title!r} are more than the {_MOST_COLUMNS} that are read")
+        _check(len(fields), _MOST_COLUMNS, f"columns in sheet {title!r}")
         if fields:
             kept.append(fields)
             size += sum(map(len, fields)) + 60 * len(fields)  # as Python keeps text
             _check_unpacked(size)
     return kept
+
+
+def _sheet(path: Path, file_format: FileFormat) -> pd.DataFrame:
+    """The sheet of a workbook that holds the record, and those that continue it."""
+    sheets = _sheets(path)
+    title, line = _find_header({each: rows[: _HEAD_LINES + _FIRST_ROWS] for each, rows in sheets.items()}, file_format)
+    header = sheets[title][line]
+    parts = [rows[rows.index(header) + 1 :] for rows in sheets.values() if header in rows[:_HEAD_LINES]]
+    width = len(header)
+    return pd.DataFrame([[*row[:width], *[""] * (width - len(row))] for rows in parts for row in rows], columns=header)
 
 
 def _open_parquet(path: Path) -> Opened:
@@ -445,34 +356,30 @@ def _open_parquet(path: Path) -> Opened:
 
         with parquet.ParquetFile(path) as file:
             metadata, fields = file.metadata, list(file.schema_arrow)
-            _check_rows(metadata.num_rows, path.stat().st_size)
-            sizes: Counter[str] = Counter()
-            for group, n in itertools.product(range(metadata.num_row_groups), range(metadata.num_columns)):
-                chunk = metadata.row_group(group).column(n)
-                sizes[chunk.path_in_schema.split(".")[0]] += chunk.total_uncompressed_size
-    is_text = {each.name: types.is_string(each.type) or types.is_large_string(each.type) for each in fields}
+    _check_rows(metadata.num_rows, path.stat().st_size)
+    sizes: Counter[str] = Counter()
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        for chunk in map(group.column, range(metadata.num_columns)):
+            sizes[chunk.path_in_schema.split(".")[0]] += chunk.total_uncompressed_size
+    text = [each.name for each in fields if types.is_string(each.type) or types.is_large_string(each.type)]
     is_plain = {each.name: not types.is_nested(each.type) and not types.is_binary(each.type) for each in fields}
     counts = Counter(each.name for each in fields)  # of a name that comes twice nothing tells which is meant
-    usable = [each.name for each in fields if is_plain[each.name] and counts[each.name] == 1]
-    usable = [name for name in usable if sizes[name] <= LARGEST_UNPACKED_BYTES // 8]
+    usable = {name for name in counts if is_plain[name] and counts[name] == 1 and sizes[name] <= LARGEST_UNPACKED_BYTES // 8}
+    names = [each.name if each.name in usable else "" for each in fields]
 
-    def read(names: Sequence[str], most_rows: int | None = None) -> pd.DataFrame:
-        text = [name for name in names if is_text[name]]
+    def read(wanted: Sequence[str], most_rows: int) -> pd.DataFrame:
         with _reading("Parquet", "parquet"), parquet.ParquetFile(path, read_dictionary=text) as file:
+            batch = next(file.iter_batches(max(most_rows, 1), columns=wanted), None)
             # the metadata of pandas would make an index of a column
-            if most_rows is None:
-                return file.read(columns=names).to_pandas(ignore_metadata=True)
-            first = next(file.iter_batches(most_rows, columns=names), None)
-            return pd.DataFrame(columns=[*names]) if first is None else first.to_pandas(ignore_metadata=True)
+            return pd.DataFrame(columns=[*wanted]) if batch is None else batch.to_pandas(ignore_metadata=True)
 
     def read_columns_of(found: Recognised) -> pd.DataFrame:
-        name_of = {key: fields[column.position].name for key, column in found.columns.items()}
-        table = read(sorted({*name_of.values()}))
+        name_of = {key: names[column.position] for key, column in found.columns.items()}
+        table = read(sorted({*name_of.values()}), metadata.num_rows)
         return pd.DataFrame({key: table[name] for key, name in name_of.items()})
 
-    names = [each.name if each.name in usable else "" for each in fields]
-    head = read(usable, _FIRST_ROWS).reindex(columns=[each.name for each in fields])
-    return Opened(names, _first_rows(head), read_columns_of)
+    head = read([*filter(None, names)], _FIRST_ROWS)
+    return Opened(names, _first_rows(head.reindex(columns=names)), read_columns_of)
 
 
 def _read_neware(path: Path) -> pd.DataFrame:

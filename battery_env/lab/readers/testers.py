@@ -16,9 +16,11 @@ else:
 
 #: What a column may hold, and what a record must have.
 QUANTITIES = tuple(
-    "time step_time date voltage counter current power charge_step temperature ambient capacity cycle step cell state".split()
+    "time date voltage counter current power charge_step temperature ambient capacity cycle step cell state".split()
 )
 REQUIRED = ("time", "voltage", "current")
+#: What may stand in the place of a quantity that a record must have.
+INSTEAD = {"time": ("date",), "current": ("power", "charge_step")}
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,8 @@ class Tester:
 
     :param name: what it is called
     :param columns: by quantity, the names of its column without units, the first that a table has is taken. Capitals, blanks
-        and signs do not count. ``time`` runs through the test and ``step_time`` starts anew with each step; ``counter`` is an
-        electrode against which the voltage is measured, ``charge_step`` the charge since the row before, and ``capacity`` the
-        tester's own count of what is drawn
+        and signs do not count. ``time`` runs through the test; ``counter`` is an electrode against which the voltage is
+        measured, ``charge_step`` the charge since the row before, and ``capacity`` the tester's own count of what is drawn
     :param told_by: names of which a table of this tester has one
     :param units: by quantity, its unit where the name in the table says none; else s, V, A, degC and Ah
     :param discharge_is_negative: how the current of a discharge is counted, where voltage and words do not tell
@@ -59,52 +60,51 @@ def _listed(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-# Names that are plain, too, are only in the row of these, but for clocks: which of a tester's names runs through the test, and
-# which starts anew with each step, differs.
+# Names that are plain, too, are only in the row of these, but for clocks, of which that of the test comes first.
 _KNOWN = (
     _row(
         "Arbin", "Data_Point, dV/dt", negative=True, count="Ah", time="Test_Time", date="Date_Time",
-        step_time="Step_Time", temperature="Aux_Temperature_1, Aux_Temperature", cell="Channel_ID",
+        temperature="Aux_Temperature_1, Aux_Temperature", cell="Channel_ID",
     ),
     _row(
         "Maccor", "DPT Time, Amp-hr, Rec#, Cycle P", missing="N/A", count="Ah", time="TestTime, Test", date="DPT Time",
-        step_time="StepTime, Step Sec, Step Min", voltage="Volts, mVolts", current="Amps, mAmps", capacity="Amp-hr, Cap.",
+        voltage="Volts, mVolts", current="Amps, mAmps", capacity="Amp-hr, Cap.",
         temperature="Temp 1, EV Temp", cycle="Cyc#, Cycle P, Cycle C", state="State, Md",
     ),
     _row(
         "BioLogic", "Ewe, Ecell, Ewe-Ece, <Ewe>, Ns changes", negative=True, encoding="latin-1", time="time",
-        step_time="step time", voltage="Ewe-Ece, Ecell, Ewe, <Ewe>", counter="Ece", current="I, <I>", power="P, Pwe",
+        voltage="Ewe-Ece, Ecell, Ewe, <Ewe>", counter="Ece", current="I, <I>", power="P, Pwe",
         charge_step="dq", capacity="Q discharge", cycle="cycle number", step="Ns",
     ),
     _row(
         "Neware", "DataPoint, Record number, Record ID, Chg. Cap., DChg. Cap., Relative Time, Cumulative Time, 工步号",
-        encoding="gb18030", missing="--", time="Total Time, Cumulative Time, Test Time, 总时间, 累计时间",
-        date="Date, Absolute Time, Realtime, Timestamp, 绝对时间, 系统时间, 日期",
-        step_time="Time, Step Time, Relative Time, 时间, 相对时间, 步骤时间, 工步时间", voltage="Voltage, 电压",
+        encoding="gb18030", missing="--",
+        time="Total Time, Cumulative Time, Test Time, 总时间, 累计时间, Time, Relative Time, 时间, 相对时间",
+        date="Date, Absolute Time, Realtime, Timestamp, 绝对时间, 系统时间, 日期", voltage="Voltage, 电压",
         current="Current, Cur, 电流", temperature="T1, 温度, 电池温度", capacity="DChg. Cap., Capacitance DChg, 放电容量",
         cycle="Cycle Index, Cycle ID, 循环, 循环号, 循环序号", step="Step Index, Step ID, 工步, 工步号, 工步序号",
         state="Step Type, 状态, 工步类型, 工步状态",
     ),
     _row(
         "Basytec", "t-Step, t-Set, Ah-Step, Ah-Cyc-Discharge", negative=True, encoding="latin-1", time="~Time, Time, Zeit",
-        date="Date", step_time="t-Step", capacity="Ah-Cyc-Discharge", cycle="Cyc-Count", step="Line", state="Command",
+        date="Date", capacity="Ah-Cyc-Discharge", cycle="Cyc-Count", step="Line", state="Command",
     ),
     _row(
         "Novonix", "Run Time, Circuit Temperature", negative=True, encoding="latin-1", time="Run Time", date="Date and Time",
-        step_time="Step Time", voltage="Potential",
+        voltage="Potential",
     ),
     _row(
         "Digatron", "Prog Time, Program Time, Program Duration, Programmdauer, AhAccu, AhStep", negative=True,
         encoding="latin-1", time="Prog Time, Program Time, Program Duration, Programmdauer, Programmzeit",
-        date="Time Stamp, Zeitstempel", step_time="Step Time, Step Duration, Schrittdauer", temperature="LogTemp001",
+        date="Time Stamp, Zeitstempel", temperature="LogTemp001",
     ),
     _row(
         "Landt", "channel_index, SysTime, Step-State, 测试时间", encoding="gb18030", time="TestTime, 测试时间",
-        date="SysTime, Date Time ISO string, 系统时间", step_time="StepTime, 工步时间", temperature="Temperature 1",
+        date="SysTime, Date Time ISO string, 系统时间", temperature="Temperature 1",
         state="Step Name, StepMode, Step-State",
     ),
     _row(
-        "PEC", "Load On Time, Position Start Time", negative=True, time="Total Time", date="Real Time", step_time="Step Time",
+        "PEC", "Load On Time, Position Start Time", negative=True, time="Total Time", date="Real Time",
         state="Instruction Name",
     ),
     _row("Gamry", "Vf, Im", time="T", voltage="Vf", current="Im"),
@@ -116,7 +116,7 @@ _KNOWN = (
     _row("CALCE (text of Cadex)", "mV", time="Time", voltage="mV", current="mA"),
     _row(
         "Battery Data Format", "Unix Time, Test Time", negative=True, time="Test Time", date="Unix Time, Date Time",
-        step_time="Step Time", temperature="Surface Temperature T1, Temperature T1", capacity="Discharging Capacity",
+        temperature="Surface Temperature T1, Temperature T1", capacity="Discharging Capacity",
     ),
 )  # fmt: skip
 _PLAIN = _row(
@@ -124,7 +124,6 @@ _PLAIN = _row(
     time="time, total time, elapsed time, accumulated time, record time, elapsed, test, relative time, seconds, t, testzeit, "
     "prüfzeit, gesamtzeit, laufzeit, zeit, temps total, temps, tempo, tiempo",
     date="date time, timestamp, date, absolute time, system time, datum, datum uhrzeit, fecha",
-    step_time="step time, t step, schrittzeit, temps étape",
     voltage="voltage, cell voltage, terminal voltage, battery voltage, voltage measured, measured voltage, volts, volt, u, v, "
     "cell potential, u cell, v cell, u bat, v bat, u batt, v batt, spannung, zellspannung, klemmenspannung, u zelle, "
     "batteriespannung, tension, tension cellule, tensión, tensão, tensao, voltaje",
@@ -137,28 +136,23 @@ _PLAIN = _row(
     capacity="discharge capacity, discharged capacity, capacity, cap, ah, entladekapazität, kapazität",
     cycle="cycle, cycle index, cycle number, cycle no, cycle count, cyc, zyklus, zyklusnummer, ciclo",
     step="step, step index, step number, step no, steps, schritt, schrittnummer, etape, étape",
-    state="state, status, mode, step type, zustand",
+    state="state, status, mode, step type, zustand, betriebsart, modus, estado, état, etat",
     cell="cell id, cell name, cell number, cell no, cell, battery id, battery, barcode, serial number, channel, "
     "channel number, zelle",
 )  # fmt: skip
 
 
-def joined(first: Tester, others: Sequence[Tester], clocks: bool = True) -> Tester:
-    """A row that knows the names of others behind its own; those of clocks, which differ in what they count, if asked for."""
+def joined(first: Tester, *others: Tester) -> Tester:
+    """A row that knows the names of others behind its own."""
     columns = {
         quantity: list(dict.fromkeys(name for each in (first, *others) for name in each.columns.get(quantity, ())))
         for quantity in QUANTITIES
-        if clocks or quantity not in ("time", "date", "step_time")
     }
-    missing = list(dict.fromkeys(text for each in (first, *others) for text in each.missing))
-    return replace(first, columns={**first.columns, **columns}, missing=missing)
+    return replace(first, columns=columns, missing=[*first.missing, *(text for each in others for text in each.missing)])
 
 
-_ANY = joined(_PLAIN, _KNOWN)
 #: The rows, in the order in which they are tried; the last one knows the names of all.
-TESTERS = (*(joined(each, [_ANY], clocks=False) for each in _KNOWN), _ANY)
-#: Names of a second clock, which may tell what the first one counts in.
-BESIDE = (*_ANY.columns["date"], *_ANY.columns["time"])
+TESTERS = (*_KNOWN, joined(_PLAIN, *_KNOWN))
 #: How text is encoded that is not UTF-8.
 ENCODINGS = tuple(dict.fromkeys(each.encoding for each in (_PLAIN, *_KNOWN) if each.encoding))
 
@@ -169,7 +163,7 @@ def find_tester(name: str | Path | Tester | None) -> Tester | None:
         return name
     for tester in TESTERS:
         if tester.name.lower() == str(name).strip().lower():
-            return tester
+            return joined(tester, TESTERS[-1])
     path = Path(name)
     if not path.is_file():
         known = ", ".join(tester.name for tester in TESTERS)
@@ -187,20 +181,12 @@ def _checked(path: Path, content: dict[str, Any]) -> Tester:
         if key not in kinds or not isinstance(value, kinds[key]):
             known = ", ".join(f"{name} ({kind.__name__})" for name, kind in kinds.items())
             raise ValueError(f"{path}: a tester has {known}, got {key} = {value!r}")
-    columns = {key: [value] if isinstance(value, str) else value for key, value in content.get("columns", {}).items() if value}
-    units = {key: value for key, value in content.get("units", {}).items() if value}
+    columns, units = content.get("columns", {}), content.get("units", {})
     for key, value in (*columns.items(), *units.items()):
-        if key not in QUANTITIES or not all(isinstance(text, str) for text in value):
+        if key not in QUANTITIES or not isinstance(value, str):
             raise ValueError(f"{path}: names and units are text by quantity ({', '.join(QUANTITIES)}), got {key} = {value!r}")
-    own = Tester(
-        content.get("name", path.stem),
-        columns,
-        units=units,
-        discharge_is_negative=content.get("discharge_is_negative"),
-        encoding=content.get("encoding", ""),
-        missing=content.get("missing", []),
-    )
-    return joined(own, [_ANY])
+    listed = {"columns": {quantity: [name] for quantity, name in columns.items()}}
+    return joined(Tester(**{"name": path.stem} | content | listed), TESTERS[-1])
 
 
 def tester_file(columns: Mapping[str, Any], names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -211,26 +197,20 @@ def tester_file(columns: Mapping[str, Any], names: Sequence[str], rows: Sequence
     :param names: all names of the table
     :param rows: its first rows
     """
-    lines: dict[str, list[str]] = {"columns": [], "units": []}
-    for quantity in QUANTITIES:
-        found = columns.get(quantity)
-        for part, text in (("columns", found.name if found else ""), ("units", found.unit if found else "")):
-            lines[part].append(f"{'' if text else '# '}{quantity} = {_quoted(text)}")
-    return "\n".join(
-        [
-            "# A tester for battery-calibrate --tester: its columns by name, and units that the names do not tell.",
-            *(f"# {_quoted(', '.join(fields)[:200])}" for fields in (names, *rows[:2])),
-            'name = "my tester"',
-            "# discharge_is_negative = true  # where the voltage does not tell",
-            '# encoding = "latin-1"  # where the text is not UTF-8',
-            '# missing = ["--"]  # what stands for a value that was not measured',
-            "[columns]",
-            *lines["columns"],
-            "[units]",
-            *lines["units"],
-            "",
-        ]
-    )
+    lines = [
+        "# A tester for battery-calibrate --tester: its columns by name, and units that the names do not tell.",
+        *(f"# {_quoted(', '.join(fields)[:200])}" for fields in (names, *rows[:2])),
+        'name = "my tester"',
+        "# discharge_is_negative = true  # where the voltage does not tell",
+        '# encoding = "latin-1"  # where the text is not UTF-8',
+        '# missing = ["--"]  # what stands for a value that was not measured',
+    ]
+    for title, attribute in (("columns", "name"), ("units", "unit")):
+        lines.append(f"[{title}]")
+        for quantity in QUANTITIES:
+            text = getattr(columns.get(quantity), attribute, "")
+            lines.append(f"{'' if text else '# '}{quantity} = {_quoted(text)}")
+    return "\n".join([*lines, ""])
 
 
 def _quoted(text: str) -> str:
