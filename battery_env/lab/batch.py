@@ -128,8 +128,8 @@ class Processes(ThreadPoolExecutor):
             for process in set(multiprocessing.active_children()) - self._others:
                 process.terminate()
         self.shutdown(cancel_futures=True)
-        for process in self._free:
-            process.shutdown()
+        for free in self._free:
+            free.shutdown()
 
 
 def _end_with_parent() -> None:
