@@ -142,14 +142,8 @@ class Discharge:
 
     @property
     def charge_C(self) -> float:
-        """The charge drawn from the first sample to the last, C; a load comes on when the tester says, if it does."""
-        charge_C, told_s = drawn_charge_C(self), self._told_load_on_s
-        if told_s is not None and self.load.first:
-            around = slice(self.load.first - 1, self.load.first + 1)
-            (begin_s, end_s), parts_A = self.time_s[around], self.current_A[around]
-            charge_C -= float(np.diff(drawn(self.time_s, self.current_A, [begin_s, end_s]))[0])
-            charge_C += float(parts_A @ np.diff([begin_s, told_s, end_s]))
-        return charge_C
+        """The charge drawn from the first sample to the last, C."""
+        return drawn_charge_C(self)
 
     @property
     def unseen_C(self) -> float:
@@ -158,8 +152,7 @@ class Discharge:
         sensor.
         """
         history, (first, last) = self.history, self.load
-        # when the load came on may be told, and a count is that of the load alone
-        begin = first if self._told_load_on_s is not None else max(first - 1, 0)
+        begin = max(first - 1, 0)  # a count is that of the load alone
         unknown = [slice(begin, first + 1), slice(last, last + 2)] if history.is_counted else [slice(begin, None)]
         switched_C = [switched_sd_C(self.time_s[rows], self.current_A[rows])[0] for rows in unknown]
         return hypot(history.load_on_C, history.offset_A * float(np.ptp(self.time_s)), history.uncounted_C, *switched_C)
@@ -167,25 +160,13 @@ class Discharge:
     @property
     def load_on_time_s(self) -> float:
         """
-        When the load was switched on, s: when the tester says, or else midway between the last sample at rest and the first
-        one under load, as the switch falls between the two, but at most one interval of the samples under load before these. A
-        rest is often logged more seldom than a load.
+        When the load was switched on, s: midway between the last sample at rest and the first one under load, as the switch
+        falls between the two, but at most one interval of the samples under load before these. A rest is often logged more
+        seldom than a load.
         """
-        first, told_s = self.load.first, self._told_load_on_s
-        if told_s is not None:
-            return told_s
-        if not first:
+        if not (first := self.load.first):
             return float(self.time_s[0])
         return float(switch_times_s(self.time_s, self.current_A, np.array([first - 1]))[0])
-
-    @property
-    def _told_load_on_s(self) -> float | None:
-        """When the tester says that the load was switched on, if the rows may say so, too: after the last one at rest."""
-        told_s = self.history.load_on_s
-        if told_s is None:
-            return None
-        first = self.load.first
-        return told_s if (not first or self.time_s[first - 1] <= told_s) and told_s <= self.time_s[first] else None
 
     def _first_below(self, cut_off_V: float) -> int | None:
         """The first sample under load that is at the cut-off or below."""
@@ -296,9 +277,8 @@ class Discharge:
         starts_at_rest, history = self.starts_at_rest, self.history
         if first:
             starts_at_rest = bool(abs(self.current_A[resting]) <= REST_CURRENT_A)
-            history = history._replace(rest_s=float(self.time_s[resting] - self.time_s[0]))
-            if self._told_load_on_s is None:
-                history = history._replace(load_on_C=load_on_sd_C(self.time_s, self.current_A, first, start_s))
+            load_on_C = load_on_sd_C(self.time_s, self.current_A, first, start_s)
+            history = history._replace(rest_s=float(self.time_s[resting] - self.time_s[0]), load_on_C=load_on_C)
         if (offset_A := rest_current_A(self.current_A)) is not None:
             history = history._replace(offset_A=offset_A)
         return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest, history=history)

@@ -49,8 +49,6 @@ class ChargeHistory(NamedTuple):
     at_rest: bool = False
     rest_s: float = 0.0  # how long the cell rested before the load
     charge: ChargeBefore | None = None  # the one before; ``None``: not recorded
-    # when the load came on, as the tester says, on the clock of the record; ``None``: it does not
-    load_on_s: float | None = None
     load_on_C: float = 0.0  # sd of the charge by the moment of load-on, which lies between two samples
     offset_A: float = 0.0  # what flows at rest
     is_counted: bool = False  # whether the tester counted the charge

@@ -266,13 +266,6 @@ def test_other_texts_are_refused_with_their_first_lines(text, message, tmp_path)
             read_discharges(tmp_path / "cell.csv")
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.integers(1, ROWS - 2), st.sampled_from([-5e-4, 1e-4, 5e-4]), st.integers(1, 3))
-def test_a_row_that_comes_again_is_left_out(row, more, times):
-    again = TABLE.iloc[np.repeat(row, times)] + np.outer(np.arange(1, times + 1), [0.0, more, more])
-    near(read(pd.concat([TABLE[: row + 1], again, TABLE[row + 1 :]], ignore_index=True), "has the time of the row before"))
-
-
 @pytest.mark.parametrize("with_step", [True, False])
 def test_at_a_switch_the_order_of_the_rows_tells(with_step):
     table = TABLE.assign(current=TABLE["current"].where(TABLE.index < 150, 0.0))
