@@ -149,8 +149,8 @@ def recognise(
     ``Current(mA)``, ``Voltage / V``, ``mAmps`` or ``test_time_second``, or from the line below it; one of another quantity
     rules a column out.
     """
-    for option, stated in (("columns", file_format.columns), ("units", file_format.units)):
-        if unknown := set(stated or {}) - set(QUANTITIES):
+    for option, told in (("columns", file_format.columns), ("units", file_format.units)):
+        if unknown := set(told or {}) - set(QUANTITIES):
             raise ValueError(f"{option} knows {', '.join(QUANTITIES)}, got {', '.join(sorted(unknown))}")
     labels = _labels(names, rows, {name.strip() for name in file_format.ignore})
     present = {key for label in labels for key, _, is_guess in _readings(label) if not is_guess}
