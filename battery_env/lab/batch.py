@@ -113,12 +113,13 @@ class Processes(ThreadPoolExecutor):
         return future.result()
 
     def _done_by_a_process(self, call: Callable[[], Any]) -> Future[Any]:
-        # spawn: torch does not survive a fork with threads
-        spawn = multiprocessing.get_context("spawn")
-        process = self._free.pop() if self._free else ProcessPoolExecutor(1, spawn, initializer=_end_with_parent)
-        future = process.submit(call)
+        try:
+            one = self._free.pop()
+        except IndexError:  # spawn: torch does not survive a fork with threads
+            one = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+        future = one.submit(call)
         if not isinstance(future.exception(), BrokenExecutor):
-            self._free.append(process)
+            self._free.append(one)
         return future
 
     def __exit__(self, *error: Any) -> None:
