@@ -358,11 +358,9 @@ def is_smeared(evidence: Row) -> bool:
 @compiled
 def doubt_reason(evidence: Row, sd_C: float) -> int:
     """Say which charge that nobody saw makes most of a standard deviation of ``q_mobile``; 0 if none does."""
-    number = 0
-    for doubt_C in _doubts_C(evidence):
+    for number, doubt_C in enumerate(_doubts_C(evidence)):
         if doubt_C > MOST_OF_SD * sd_C:
             return int(_DOUBTS[number])
-        number += 1
     return 0
 
 
