@@ -128,7 +128,7 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
         else:
             advice = (
                 "Sort the samples, and give one discharge at a time, or number them in a column of the cycle. A clock that "
-                "starts anew at midnight needs dates, and one that does with each step a column of the step"
+                "starts anew, at midnight or with each step, needs dates"
             )
         raise ValueError(
             f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "

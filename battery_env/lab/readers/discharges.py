@@ -81,11 +81,10 @@ def read_discharges(
     files, with the extra ``excel`` a workbook, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or BioLogic
     (.mpr). Columns go by the names that testers give them; their units are told from the names.
 
-    It may hold charges and rests as well, many cycles, and several cells if a column names them. A discharge is what lies
-    between two charges, with the rest before the load; it is numbered by the cycle that is given, or else counted. If there
-    are several, each has its own clock, which starts at its first sample. Discharges whose charges are not logged are told
-    apart by the column of the cycle alone. What is mended is said in a warning. A temperature that is missing in some rows is
-    interpolated.
+    It may hold charges and rests of the cell as well, and many cycles. A discharge is what lies between two charges, with the
+    rest before the load; it is numbered by the cycle that is given, or else counted. If there are several, each has its own
+    clock, which starts at its first sample. Discharges whose charges are not logged are told apart by the column of the cycle
+    alone. What is mended is said in a warning. A temperature that is missing in some rows is interpolated.
 
     .. code-block:: python
 
@@ -153,7 +152,7 @@ def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) ->
 def read_recordings(source: str | Path | pd.DataFrame, file_format: FileFormat) -> list[Recording]:
     """
     The discharges of a file or a table before they are checked, so that one that cannot be used does not lose the others; one
-    at least. Those of a table of several cells have the ``cell`` in their ``meta``.
+    at least.
     """
     name = _name_of(source)
     try:
