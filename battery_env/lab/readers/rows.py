@@ -269,9 +269,10 @@ def in_order(rows: pd.DataFrame) -> pd.DataFrame:
         say("the clock runs backwards: the rows are taken from the last one to the first")
         return in_order(rows[::-1])
     if back.any():
-        n, time_s = int(np.argmax(back)), rows["time"].to_numpy()
+        first, time_s = int(np.argmax(back)), rows["time"].to_numpy()
+        now_s, before_s = time_s[first], time_s[first - 1]
         raise ValueError(
-            f"the clock goes back: row {place_of(rows, back)} is at {time_s[n]:g} s, after {time_s[n - 1]:g} s. Give the time "
+            f"the clock goes back: row {place_of(rows, back)} is at {now_s:g} s, after {before_s:g} s. Give the time "
             "since the start of the test, or dates in UTC; number tests in a column of the cycle, or give each "
             "a file"
         )
