@@ -163,8 +163,8 @@ class Reason(IntEnum):
         "q_mobile",
     )
     UNCOUNTED = (
-        "The tester counted another charge than current and time make, its clock starts anew with each step, or currents are "
-        "missing: {uncounted_C:.0f} C are in doubt. Check units and clock, and export the time since the start of the test.",
+        "The tester counted another charge than current and time make: {uncounted_C:.0f} C are in doubt. Check units and "
+        "clock, and export the time since the start of the test.",
         "q_mobile",
     )
     Q_DROPPED = _DROPPED.format("{dropped_C:.0f} C are"), "q_mobile"

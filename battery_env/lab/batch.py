@@ -480,16 +480,11 @@ def _places(source: Source, read: Attempt | None, used: set[str]) -> Iterator[tu
         known = Outcome(name, source.path, source.cell, source.cycle, notes="; ".join(read.notes), error=error)
         yield _Place(known, source, 0, 1), None
         return
-    is_one = len({each.meta.get("cell") for each in read.result}) == 1
     for number, recording in enumerate(read.result):
-        stem, cell, cycle = source.stem, source.cell, recording.meta.get("cycle")
-        if not is_one:  # a table of several cells names them
-            cell = recording.meta["cell"]
-            stem = "_".join((stem, *re.findall(r"[\w.-]+", cell)))
-        name = _unused(record_name(stem, cycle), used)
-        yield _Place(
-            Outcome(name, source.path, cell, cycle, notes="; ".join(read.notes)), source, number, len(read.result)
-        ), recording
+        cycle = recording.meta.get("cycle")
+        name = _unused(record_name(source.stem, cycle), used)
+        known = Outcome(name, source.path, source.cell, cycle, notes="; ".join(read.notes))
+        yield _Place(known, source, number, len(read.result)), recording
 
 
 def _unused(name: str, used: set[str]) -> str:

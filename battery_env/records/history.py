@@ -52,8 +52,7 @@ class ChargeHistory(NamedTuple):
     load_on_C: float = 0.0  # sd of the charge by the moment of load-on, which lies between two samples
     offset_A: float = 0.0  # what flows at rest
     is_counted: bool = False  # whether the tester counted the charge
-    # by how much it counted another charge or, without a count, what a clock of each step does not tell
-    uncounted_C: float = 0.0
+    uncounted_C: float = 0.0  # by how much it counted another charge
 
 
 def history_of(record: Any) -> ChargeHistory:
