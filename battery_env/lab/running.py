@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -175,38 +174,42 @@ def files_of(argument: str, folder: Path) -> list[Path]:
     return [folder / f"{name}_forecast.{suffix}" for suffix in ("json", "png")]
 
 
-def _read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
+def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
     """
-    Read the discharges of a cell before the one in progress, up to it where it is among them, in the order in which they
-    began where each tells, and else in that of the names. All that is named counts as of one cell: of several folders with a
-    warning. What cannot be read is left out with a warning.
+    Read the discharges of a cell before the one in progress, in the order in which they began where each tells, and else in
+    that of the names; where the one in progress is among them, those before it. All that is named counts as of one cell: of
+    several folders with a warning. What cannot be read is left out with a warning.
     """
-    discharges: list[Discharge] = []
+    before: list[Discharge] = []
+    after: list[Discharge] = []
+    named, began = before, ""
     sources = find_sources(arguments)
     folders = sorted({str(Path(source.path).parent) for source in sources})
     if len(folders) > 1:
         warnings.warn(f"--life: the records of {', '.join(folders)} are taken for one cell's", stacklevel=2)
     for source in sources:
-        is_reached = Path(source.path).resolve() == Path(running.path).resolve()
+        is_its_file = Path(source.path).resolve() == Path(running.path).resolve()
         try:
             recordings = read_source(source, file_format)
         except Exception as error:  # readers of files raise what they like
             warnings.warn(f"{source.argument} is left out: {' '.join(str(error).split())}", stacklevel=2)
             continue
         for recording in recordings:
-            if is_reached and recording.meta.get("cycle", math.inf) >= (running.cycle or 0):
+            number = recording.meta.get("cycle", "")
+            if is_its_file and running.cycle in (None, number):
+                named, began = after, recording.meta.get("start_time", "")
                 continue
             try:
-                discharges.append(recording.discharge())
+                named.append(recording.discharge())
             except (TypeError, ValueError) as error:
-                number = recording.meta.get("cycle", "")
                 warnings.warn(f"{source.path}:{number} is left out: {error}", stacklevel=2)
-        if is_reached:
-            break  # what follows is the future
-    if not discharges:
+    everything = [*before, *after]
+    if all(each.meta.get("start_time") for each in everything) and (began or named is before):
+        everything.sort(key=lambda each: each.meta["start_time"])
+        before = [each for each in everything if not began or each.meta["start_time"] < began]
+    if not before:
         raise ValueError(f"{', '.join(arguments)}: no discharge before {running.argument}")
-    begins = [each.meta.get("start_time") for each in discharges]
-    return sorted(discharges, key=lambda each: each.meta["start_time"]) if all(begins) else discharges
+    return before
 
 
 def _with_prior(settings: Settings, prior_q_mobile_C: tuple[float, float]) -> Settings:
@@ -237,7 +240,7 @@ def end_of_record(
     source, running = sources[0]._replace(cycle=recording.meta.get("cycle")), recording.discharge()
     past = None
     if life:
-        before = _read_life(life, source, file_format)
+        before = read_life(life, source, file_format)
         named = sorted({each.meta["cell"] for each in [*before, running] if "cell" in each.meta})
         if len(named) > 1:
             raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")

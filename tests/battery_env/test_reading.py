@@ -518,10 +518,17 @@ def test_a_life_is_in_the_order_of_its_dates_or_else_of_its_names(tmp_path):
     for name, day in (("cell_10.csv", 1), ("cell_2.csv", 2)):
         TABLE.assign(Date=DATES + pd.Timedelta(days=day)).to_csv(tmp_path / name, index=False)
     running = Source("B0005", 1, "B0005", "B0005", "B0005:1")
-    found = running_module._read_life([str(tmp_path)], running, FileFormat())
+    found = running_module.read_life([str(tmp_path)], running, FileFormat())
     assert [Path(each.meta["source"]).name for each in found] == ["cell_10.csv", "cell_2.csv"]
-    found = running_module._read_life([str(tmp_path)], running, FileFormat(ignore=["Date"]))
+    found = running_module.read_life([str(tmp_path)], running, FileFormat(ignore=["Date"]))
     assert [Path(each.meta["source"]).name for each in found] == ["cell_2.csv", "cell_10.csv"]
+    # and what began after the one in progress is no part of it, whatever its name
+    running = Source(str(tmp_path / "cell_2.csv"), None, "cell_2", "", "cell_2.csv")
+    assert [Path(each.meta["source"]).name for each in running_module.read_life([str(tmp_path)], running, FileFormat())] == [
+        "cell_10.csv"
+    ]
+    with pytest.raises(ValueError, match="no discharge before"):
+        running_module.read_life([str(tmp_path)], running, FileFormat(ignore=["Date"]))
 
 
 def hostile(kind):
