@@ -106,7 +106,7 @@ def calibrate(
         meant = get_close_matches(name, known, 1)
         raise TypeError(f"calibrate takes no {name!r}: " + (f"did you mean {meant[0]}?" if meant else f"give {[*known]}"))
     of_file = {name: options.pop(name) for name in options.keys() - SettingsOptions.__annotations__.keys()}
-    settings = Settings(**options) if settings is None else replace(settings, **options)
+    settings = (Settings() if settings is None else settings).but(**options)
     if isinstance(source, Discharge):
         return calibrated(source, settings)
     file_format = FileFormat(**of_file | {"tester": find_tester(of_file.get("tester"))})

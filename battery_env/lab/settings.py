@@ -140,6 +140,11 @@ class Settings:
             return {"cut_off_V": self.cell.cell.VEOD, "mismatch_V": self.cell.mismatch_V, "thermal": thermal}
         return {"cut_off_V": CUT_OFF_V, "mismatch_V": UNFITTED_MISMATCH_V, "thermal": True}
 
+    def but(self, **others: Any) -> Settings:
+        """The same with other settings; what nobody stated of another cell is what that one tells."""
+        unstated = {name: None for name, value in self._known_of_the_cell().items() if getattr(self, name) == value}
+        return replace(self, **unstated | others)
+
     @property
     def constants(self) -> CellParameters:
         """Of the model."""

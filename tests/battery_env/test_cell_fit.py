@@ -266,6 +266,8 @@ class TestFiles:
         assert Settings(cell=fit, mismatch_V=0.1).mismatch_V == 0.1 and Settings(cell=OTHER).mismatch_V == 0.05
         assert Settings(method=method).calibrator(NEW_CELL).bounds == LeastSquares().bounds == ExtendedKalmanFilter().bounds
         assert not Settings(cell=dataclasses.replace(fit, thermal=False)).thermal
+        assert Settings(method=method).but(cell=fit) == settings and settings.but(cell=OTHER).mismatch_V == 0.05
+        assert Settings(mismatch_V=0.1).but(cell=fit).mismatch_V == 0.1
 
     @pytest.mark.parametrize(
         ("kind", "change", "message"),
