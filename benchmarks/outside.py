@@ -54,7 +54,8 @@ ALGORITHMS = {
     "tqc": ("TQC", "sb3_contrib:TQC"),
 }
 _SETTINGS = {"lac_common": setting_of_lac(), "lac_lower_start": {"ent_coef": "auto_0.1"}}
-OURS, RIVALS = ("lac", "lac_lower_start"), ("sac", "td3", "tqc")
+OURS = ("lac", "lac_lower_start")
+RIVALS = ("sac", "td3", "tqc")
 _CAR = {
     "learning_rate": 3e-4,
     "buffer_size": 50_000,
@@ -169,7 +170,8 @@ def report(rows: pd.DataFrame, compared: pd.DataFrame) -> str:
         }
         for row in compared.to_dict("records")
     ]
-    text = f"Return of the mean action at the end, interquartile mean over seeds and its 95 % interval:\n\n{markdown(returns)}"
+    text = "Return of the mean action at the end, interquartile mean over seeds with its 95 % interval, higher is better:\n\n"
+    text += markdown(returns)
     if cells:
         text += "\nLAC against the others, with 95 % intervals; above 0, and above 0.5, LAC is ahead:\n\n"
         text += markdown(cells)

@@ -256,12 +256,15 @@ MOST = {
     # 247 lines and 3 numbers for the error that drifts and for steps of the voltage: engineers with worn cells, whose slow
     # diffusion was stated as R_o, and with records that lost rows; the formula of one common error went. 11 for exports of
     # millions of rows with a clock as text; the rule for cycles of impossible currents went. 75 for engineers whose load is
-    # switched between rows, or whose current drops out: R_o was too sure; a likelihood of each start of a search went
-    ("lines", "battery_env"): 18_898,
+    # switched between rows, or whose current drops out: R_o was too sure; a likelihood of each start of a search went. 1 for
+    # lives whose files are not named in the order of their dates, and for settings that are given another cell
+    ("lines", "battery_env"): 18_899,
     ("lines", "sb3_lac"): 6_886,
-    ("lines", "benchmarks"): 6_135,
-    # the same users: the page is started, asked by strangers, killed, and looked at in a browser
-    ("lines", "tests"): 17_770,
+    # 2 for readers of the outside tasks, whose table says which way is up
+    ("lines", "benchmarks"): 6_137,
+    # the same users: the page is started, asked by strangers, killed, and looked at in a browser;
+    # and gaps between pulses, and lives in the order of their dates
+    ("lines", "tests"): 17_784,
     ("numbers at the top of modules", "battery_env"): 203,
     ("numbers at the top of modules", "sb3_lac"): 20,
     ("starred calls", "battery_env"): 58,

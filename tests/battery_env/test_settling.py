@@ -135,6 +135,10 @@ VERDICTS = {
         BOTH, lost(discharged(np.where(SECONDS < 1500, 2.0, 1.0), noise_V=0.003), 1400.0, 1700.0), {},
         "No sample lies between 1400 s and 1701 s, and the voltage does not show that the load was on",
     ),
+    "pulses meanwhile": (
+        BOTH[:1], lost(discharged(pulsed(30, 60, 3.0, 0.3), noise_V=0.002), 1504.0, 1804.0), {"mismatch_V": 0.02},
+        "No sample lies between 1504 s and 1805 s, and the voltage does not show that the load was on",
+    ),
     "current lost again and again": (
         BOTH[1:], lost_now_and_then(discharged(noise_V=0.001), 14),
         {}, "The current changes for a moment, and the voltage does not follow: 140 C are in doubt.",
@@ -167,6 +171,7 @@ ALONE = {
     "noise hides whether it was drawn": "r_o",
     "switched meanwhile": "r_o",
     "current lost again and again": "r_o",
+    "pulses meanwhile": "r_o",
     "gain of the current": "r_o",
     "charge at the start": "r_o",
     "prior of q_mobile": "r_o",
