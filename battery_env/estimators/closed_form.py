@@ -40,11 +40,11 @@ class ClosedForm(Estimator):
         negative_C = record.state[-2:, [QNB, QNS]].sum(axis=1)
         moved_C, drawn_C = float(negative_C[0] - negative_C[1]), float(record.current_A[-2]) * record.dt_s
         diagnosis = Diagnosis()
-        diagnosis.note(Reason.NO_CURRENT, bool(np.isnan(r_o)))
         contradicted = abs(moved_C - drawn_C) > SETTLED_SHARES["q_mobile"] * abs(moved_C)
         diagnosis.note(Reason.CHARGE_DIFFERS, contradicted, moved_C=moved_C, drawn_C=drawn_C)
         diagnosis.note(Reason.IMPLAUSIBLE, not is_plausible(q_mobile, self.cell.q_mobile))
-        verdict = diagnosis.verdict({"q_mobile": q_mobile, "r_o": r_o}, {})
+        unknown = {"r_o": np.inf} if np.isnan(r_o) else {}  # no current flows in the last step
+        verdict = diagnosis.verdict({"q_mobile": q_mobile, "r_o": r_o}, unknown, list(unknown))
         return Estimate(q_mobile, r_o, **verdict._asdict())
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]

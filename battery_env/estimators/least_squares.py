@@ -18,7 +18,7 @@ from battery_env.electrochemistry.ends import LONGEST_S
 from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_errors, memory_share
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
-from battery_env.estimators.diagnosis.evidence import dropouts_s, evidence_of, measured, start_reason, unseen_C
+from battery_env.estimators.diagnosis.evidence import dropouts_s, evidence_of, measured, unseen_C
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
@@ -325,27 +325,21 @@ class LeastSquares(Estimator):
             self.voltage_noise_V is not None,
         )
         diagnosis.note(Reason.EMPTY, n < len(record.time_s))
-        few = not is_stated and n < len(free) + SPARE_SAMPLES
-        diagnosis.note(Reason.FEW, few, of="samples", or_else=", or state voltage_noise_V")
+        diagnosis.note(Reason.FEW, not is_stated and n < len(free) + SPARE_SAMPLES)
         noise_V = self.voltage_noise_V or white_noise_V(fit.residual_V)
         # of a path the error is what its cells leave, and else what the drift allows for
         drift_V = fitted.search.error.drift_V or self.mismatch_V
-        limit_V2 = misfit_limit_V2(noise_V, n, drift_V, is_stated)
-        diagnosis.note(Reason.MISFIT, square(fit.residual_V) > n * limit_V2)
-        # a start of another charge shifts the voltage, and another kind of cell changes its course
-        course_V = float(np.std(alone.residual_V))
-        is_other = bool(start_reason(evidence) and self.mismatch_V and course_V**2 > limit_V2)
-        diagnosis.note(Reason.OTHER_KIND, is_other, rmse_mV=1e3 * course_V, mismatch_mV=1e3 * drift_V)
+        diagnosis.note(Reason.MISFIT, square(fit.residual_V) > n * misfit_limit_V2(noise_V, n, drift_V, is_stated))
         q_mobile = fit.values["q_mobile"]
         diagnosis.note(Reason.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, self.model.cell.q_mobile))
         _note_end(diagnosis, record, fitted, max(MISMATCH_MARGIN * drift_V, MOST_NOISE_SD * noise_V, RESOLUTION_V))
         if self.path is not None:
-            distance = self.path.distance_sd(fit.values)
-            diagnosis.note(Reason.BESIDE_PATH, distance > BESIDE_LIMIT_SD, distance=distance)
+            ratio = self.path.distance_sd(fit.values) / BESIDE_LIMIT_SD
+            diagnosis.note(Reason.OTHER_KIND, ratio > 1.0, what="distance from the path of aging cells", ratio=ratio)
         moved = fit.square - alone.square
-        diagnosis.note(Reason.Q_PRIOR_WRONG, moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance)
+        diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance)
         for name in fit.at_bound:
-            diagnosis.note(Reason.Q_AT_BOUND.of(name))
+            diagnosis.note_about(name, Reason.AT_BOUND)
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
         known = Assumptions(self.current_gain_sd, sd_soc / soc, is_along_path=self.path is not None)
         return diagnosis.verdict(alone.values, own, free, priors, known)

@@ -6,7 +6,7 @@ each sample.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from math import comb, hypot, nan, sqrt
 from typing import Any, NamedTuple
 
@@ -14,9 +14,15 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
-from battery_env.estimators.diagnosis.evidence import EVIDENCE, doubt_reason, fault_reason, is_smeared, start_reason
+from battery_env.estimators.diagnosis.evidence import (
+    EVIDENCE,
+    charges_in_doubt_C,
+    fault_reason,
+    is_smeared,
+    start_reason,
+)
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V, Row, table
-from battery_env.estimators.reasons import MOST_OF_SD, SETTLED_SHARES, Reason
+from battery_env.estimators.reasons import MOST_OF_SD, SETTLED_SHARES, Doubt, Reason
 from battery_env.parameters import PARAMETER_NAMES
 
 #: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
@@ -35,16 +41,14 @@ PRIOR_LIMIT_SD = 2.5
 _EXCESS_LIMIT, _EXCESS_LIMIT_UNSTATED = 5.0, 10.0
 
 _SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"])
-# By number of a reason, which of both it speaks against.
-_AGAINST = np.array([[False, False], *([name in row.against for name in PARAMETER_NAMES] for row in Reason)])
-
 #: An estimate and its verdict; pairs are of ``q_mobile`` (C) and ``r_o`` (ohm): the values, their standard deviations with all
 #: that is known and by the record alone, whether they are searched for and whether they have a prior; the first reason against
-#: each, and whether that against ``r_o`` is the larger doubt.
+#: each, which of both it names, and of one that is in doubt by what and how much; and whether ``r_o`` is in the larger doubt.
 JUDGED = table(
     [
         *((name, "f8", 2) for name in ("value", "sd", "own_sd")),
         *((name, "i8", 2) for name in ("is_searched", "has_prior", "reason")),
+        *(("about", "i8", 2), ("doubt", "i8", 2), ("in_doubt", "f8", 2)),
         ("r_o_comes_first", "b1"),
     ]
 )
@@ -56,16 +60,38 @@ class Assumptions(NamedTuple):
     gain_sd: float = 0.0  # of the current sensor, which scales both parameters
     sd_soc: float = 0.0  # of the charge at the start, as a share of it
     cell_sd_r_o: float = 0.0  # what the constants of the cell leave open of ``r_o``, ohm
+    apart: tuple[float, float] = (0.0, 0.0)  # how far a policy is from the fit in its observation, C and ohm
     is_along_path: bool = False  # whether these constants lie along a path of aging cells
 
 
 @compiled
+def _note_one(judged: Row, k: int, reason: int, about: int, holds: bool) -> None:
+    # against one number: the row of the table that comes first counts
+    row = reason + 0  # a member of an enumeration is no number in older versions of numba
+    if holds and row < judged.reason[k]:
+        judged.reason[k], judged.about[k] = row, about
+
+
+@compiled
 def note(judged: Row, reason: int, holds: bool) -> None:
-    """Note a reason, if it holds: against each number that it speaks against, the row of the table that comes first counts."""
-    row = reason + 0  # a member of an enumeration is no index in older versions of numba
-    for k in range(2):
-        if holds and _AGAINST[row, k] and row < judged.reason[k]:
-            judged.reason[k] = row
+    """Note a reason against both numbers, if it holds."""
+    _note_one(judged, 0, reason, 0, holds)
+    _note_one(judged, 1, reason, 1, holds)
+
+
+@compiled
+def note_about(judged: Row, about: int, reason: int, holds: bool) -> None:
+    """Note one that names one number, against both, if it holds."""
+    _note_one(judged, 0, reason, about, holds)
+    _note_one(judged, 1, reason, about, holds)
+
+
+@compiled
+def _note_doubt(judged: Row, k: int, doubt: int, size: float) -> None:
+    # what makes most of a standard deviation
+    if size > MOST_OF_SD * judged.sd[k] and Reason.IN_DOUBT + 0 < judged.reason[k]:
+        _note_one(judged, k, Reason.IN_DOUBT, k, True)
+        judged.doubt[k], judged.in_doubt[k] = doubt + 0, size
 
 
 @compiled
@@ -74,23 +100,27 @@ def judge(judged: Row, evidence: Row, known: Assumptions) -> None:
     start, fault = start_reason(evidence), fault_reason(evidence)
     note(judged, start, start > 0)
     note(judged, fault, fault > 0)
-    note(judged, Reason.R_SWITCHES, judged.is_searched[1] > 0 and is_smeared(evidence))
     beyond_q = beyond_r_o = 0.0  # in standard deviations that a settled one may have
     for k in range(2):
         if judged.is_searched[k] == 0:
             continue
         sd, own_sd, most_sd, is_r_o = judged.sd[k], judged.own_sd[k], _SHARES[k] * judged.value[k], k == 1
-        note(judged, Reason.Q_PRIOR_ALONE + k, judged.has_prior[k] > 0 and not own_sd < most_sd)
+        _note_one(judged, k, Reason.PRIOR_ALONE, k, judged.has_prior[k] > 0 and not own_sd < most_sd)
         if not sd < most_sd:
-            doubt = 0 if is_r_o else doubt_reason(evidence, sd)
-            note(judged, doubt, doubt > 0)
-            note(judged, Reason.R_DROPPED, is_r_o and evidence.dropped_ohm > MOST_OF_SD * sd)
-            note(judged, Reason.R_OF_CONSTANTS, is_r_o and known.cell_sd_r_o > MOST_OF_SD * sd)
-            note(judged, Reason.PATH_UNTESTED, not is_r_o and known.is_along_path)
+            note(judged, Reason.MISSED, not is_r_o and evidence.missed_C > MOST_OF_SD * sd)
+            if is_r_o:
+                _note_doubt(judged, 1, Doubt.DROPPED, evidence.dropped_ohm)
+                _note_doubt(judged, 1, Doubt.CONSTANTS, known.cell_sd_r_o)
+            else:
+                for number, size_C in enumerate(charges_in_doubt_C(evidence)):
+                    _note_doubt(judged, 0, number + 1, size_C)
+            _note_doubt(judged, k, Doubt.POLICY, known.apart[k])
+            _note_one(judged, 1, Reason.PATH_UNTESTED, 1, not is_r_o and known.is_along_path)
             scale_sd = known.gain_sd if is_r_o else hypot(known.gain_sd, known.sd_soc)
-            note(judged, Reason.Q_SCALE_UNKNOWN + k, scale_sd >= _SHARES[k])
-            note(judged, Reason.Q_IMPRECISE + k, True)
+            _note_one(judged, k, Reason.SCALE_UNKNOWN, k, scale_sd >= _SHARES[k])
+            _note_one(judged, k, Reason.IMPRECISE, k, True)
         if is_r_o:
+            _note_doubt(judged, 1, Doubt.SWITCHES, judged.value[1] if is_smeared(evidence) else 0.0)  # all of it
             beyond_r_o = max(sd, own_sd) / most_sd
         else:
             beyond_q = max(sd, own_sd) / most_sd
@@ -105,11 +135,17 @@ class Verdict(NamedTuple):
     reason: str
 
     @classmethod
-    def of(cls, first: Sequence[int], r_o_comes_first: bool, measured: Mapping[str, Any]) -> Verdict:
-        """What follows from the first reason against each number; texts are filled with what was measured."""
-        in_order = dict.fromkeys(reversed(first) if r_o_comes_first else first)
-        texts = [Reason.numbered(row).said(measured) for row in in_order if row != Reason.SETTLED]
-        return cls(first[0] == Reason.SETTLED, first[1] == Reason.SETTLED, " ".join(texts))
+    def of(cls, judged: Any, measured: Mapping[str, Any]) -> Verdict:
+        """What follows from a row of ``JUDGED``; texts are filled with what was measured."""
+        texts = []
+        for k in range(len(PARAMETER_NAMES)):
+            reason, of_doubt = Reason(judged["reason"][k]), {}
+            if reason is Reason.IN_DOUBT:
+                doubt = Doubt(judged["doubt"][k])
+                of_doubt = {"in_doubt": judged["in_doubt"][k], "doubt": doubt.text.format_map(measured)}
+            texts.append(reason.said(PARAMETER_NAMES[judged["about"][k]], {**measured, **of_doubt}))
+        in_order = dict.fromkeys(reversed(texts) if judged["r_o_comes_first"] else texts)
+        return cls(not texts[0], not texts[1], " ".join(filter(None, in_order)))
 
 
 class Diagnosis:
@@ -127,10 +163,14 @@ class Diagnosis:
         self._judged["reason"] = Reason.SETTLED
 
     def note(self, reason: Reason, holds: bool = True, /, **measured: Any) -> None:
-        """Note that a reason holds, if it does, with what was measured of it."""
+        """Note that a reason holds against both numbers, if it does, with what was measured of it."""
         if holds:
             note(self._judged, reason, True)
             self._measured = measured | self._measured
+
+    def note_about(self, number: str, reason: Reason, holds: bool = True) -> None:
+        """The same of one that names one number."""
+        note_about(self._judged, PARAMETER_NAMES.index(number), reason, holds)
 
     def verdict(
         self,
@@ -150,7 +190,7 @@ class Diagnosis:
         judged["is_searched"] = [name in searched for name in PARAMETER_NAMES]
         judged["has_prior"] = [name in priors for name in PARAMETER_NAMES]
         judge(judged, self._evidence, known or Assumptions())
-        return Verdict.of(judged["reason"].tolist(), bool(judged["r_o_comes_first"]), self._measured)
+        return Verdict.of(judged, self._measured)
 
 
 @compiled

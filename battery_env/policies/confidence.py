@@ -13,7 +13,7 @@ from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.evidence import evidence_of, measured, unseen_C
 from battery_env.estimators.diagnosis.rest import rest_voltage_V
 from battery_env.estimators.estimator import ROUNDING
-from battery_env.estimators.reasons import SETTLED_SHARES, Reason
+from battery_env.estimators.reasons import Reason
 from battery_env.estimators.search import square
 from battery_env.estimators.verdict import (
     MISMATCH_MARGIN,
@@ -76,32 +76,33 @@ class Confidence:
         model_V = self._model_V(fitted, n, record)
         evidence = evidence_of(record, cell, 1.0, (q_mobile, r_o), history, model_V)
         diagnosis = Diagnosis(evidence, measured(evidence, 1.0, float(record.time_s[0]), history.charge))
-        hidden = np.hypot([unseen_C(evidence), 0.0], fitted.estimate[n] - estimate)
+        apart = np.abs(fitted.estimate[n] - estimate)
+        hidden = np.hypot([unseen_C(evidence), 0.0], apart)
         sd = np.hypot(fitted.sd_alone[n] * [self._sd_ratio, 1.0], hidden)
         is_measured = np.isfinite(record.voltage_V)
         residual_V = (model_V - record.voltage_V)[is_measured]  # NaN after the model is empty
         white_V = white_noise_V(residual_V[np.isfinite(residual_V)])
-        readings, offset_V = len(residual_V), abs(float(fitted.offset_V[n]))
+        readings = len(residual_V)
         mismatch_V = 0.0 if path is None else path.mismatch_V
         # the first voltage may be that of a full cell with the largest offset, and noise and model beyond
         beyond_V = self._offset_V + MOST_NOISE_SD * hypot(white_V, MISMATCH_MARGIN * mismatch_V)
-        diagnosis.note(Reason.START_ABOVE, float(record.voltage_V[0]) > rest_voltage_V(cell) + beyond_V)
-        diagnosis.note(Reason.FEW, readings < len(self._parameters) + SPARE_SAMPLES, of="readings", or_else="")
+        diagnosis.note(Reason.START_DIFFERS, float(record.voltage_V[0]) > rest_voltage_V(cell) + beyond_V)
+        diagnosis.note(Reason.FEW, readings < len(self._parameters) + SPARE_SAMPLES)
         limit_V2 = misfit_limit_V2(white_V, readings, mismatch_V, negligible_V=_LINEAR_STEP_V)
-        diagnosis.note(Reason.UNEXPLAINED, not square(residual_V) <= readings * limit_V2)
-        is_off = offset_V > _OFFSET_MARGIN * self._offset_V
-        diagnosis.note(Reason.OFFSET, is_off, offset_mV=1e3 * offset_V, most_mV=1e3 * self._offset_V)
-        distance = float(fitted.constants_sd[n])
-        diagnosis.note(Reason.CONSTANTS, path is None and distance > (1.0 - ROUNDING) * REACH_SD)
-        diagnosis.note(Reason.BESIDE_PATH, path is not None and distance > BESIDE_LIMIT_SD, distance=distance)
-        differs = np.abs(fitted.estimate[n] / estimate - 1.0).tolist()
+        diagnosis.note(Reason.MISFIT, not square(residual_V) <= readings * limit_V2)
+        most_sd = REACH_SD if path is None else BESIDE_LIMIT_SD
+        for what, size, most in (
+            ("distance from the constants that it has learned of", float(fitted.constants_sd[n]), most_sd),
+            ("offset of the voltage", abs(float(fitted.offset_V[n])), _OFFSET_MARGIN * self._offset_V),
+        ):
+            if size > (1.0 - ROUNDING) * most:  # as a fit keeps within its reach
+                diagnosis.note(Reason.OTHER_KIND, what=what, ratio=size / most)
         for k, name in enumerate(PARAMETER_NAMES):
             if name in self._parameters:
-                diagnosis.note(Reason.Q_AT_BOUND.of(name), estimate[k] in ESTIMATE_RANGES[name])
-                is_apart = not differs[k] < SETTLED_SHARES[name]
-                diagnosis.note(Reason.Q_DIFFERS.of(name), is_apart, **{f"differs_{name}": differs[k]})
+                diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
         values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
-        verdict = diagnosis.verdict(values, sds, self._parameters, known=Assumptions(is_along_path=path is not None))
+        known = Assumptions(apart=(float(apart[0]), float(apart[1])), is_along_path=path is not None)
+        verdict = diagnosis.verdict(values, sds, self._parameters, known=known)
         held = [name not in self._parameters for name in PARAMETER_NAMES]
         return verdict, np.where(held, np.nan, np.hypot(self._sd_ratio * fitted.sd[n], hidden))
 

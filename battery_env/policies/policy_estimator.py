@@ -41,8 +41,8 @@ from battery_env.tasks.voltage.voltage_task import VoltageTask
 
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
-# Of a decision that is not judged.
-_NOT_JUDGED = Verdict(False, False, Reason.NOT_YET.text)
+# Of a policy without a fit, before its first decision, and of one that is not judged.
+_NOTHING_STATED = Verdict(False, False, Reason.NOTHING_STATED.text)
 
 
 class Predictor(Protocol):
@@ -159,7 +159,7 @@ class PolicyEstimator(OnlineEstimator):
     def _judge(self) -> None:
         """Tell how sure the estimate is, of the samples up to the last decision."""
         self._sd, self._found = [nan, nan], None
-        self._verdict = Verdict(False, False, Reason.NO_FIT.text) if self._confidence is None else _NOT_JUDGED
+        self._verdict = _NOTHING_STATED
         if self._confidence is not None and self._fitted is not None:
             samples = with_voltage(self._samples, self._decisions * self.decision_s)
             self._verdict, sd = self._confidence.verdict(self._fitted, 0, self._now, samples, ChargeHistory())
@@ -265,7 +265,7 @@ class PolicyEstimator(OnlineEstimator):
             return last_estimate(trace)
         first = 0 if self.task_class.is_averaged else -1
         q_mobile, r_o = (float(values[first:].mean()) for values in (trace.q_mobile, trace.r_o))
-        return Estimate(q_mobile, r_o, settled=False, reason=Reason.NO_FIT.text)
+        return Estimate(q_mobile, r_o, settled=False, reason=_NOTHING_STATED.reason)
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """The estimates over time of many discharges, run as one batch, in their order."""
@@ -290,7 +290,7 @@ class PolicyEstimator(OnlineEstimator):
                 is_open = judge_last_only & ~task.truncated()
                 for n in np.flatnonzero(running).tolist():
                     if is_open[n]:
-                        verdicts.append(_NOT_JUDGED)
+                        verdicts.append(_NOTHING_STATED)
                         found.append(None)
                         continue
                     record, history = samples[discharge[n]]

@@ -148,7 +148,7 @@ class TestCharge:
         (found,) = calibrate(cycled(4.2, last_A, rest_rows=1), method=method)
         assert found.record.history.charge.left_C == pytest.approx(left_C, rel=0.15)
         assert found.sd_q_mobile_C > left_C and found.capacity_Ah == pytest.approx(found.drawn_Ah)
-        assert settled is None or found.settled_q_mobile == settled == ("C left to take" not in found.reason)
+        assert settled is None or found.settled_q_mobile == settled == ("had some left to take" not in found.reason)
 
     @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("soc", sweep(0.98, 0.99, 0.97, 0.965))

@@ -469,7 +469,7 @@ class TestCommand:
         late = pd.read_csv("running.csv").query("time_s > 400")
         late.to_csv("late.csv", index=False)
         row = self.row(capsys, "late.csv", "--life", "lab", status=3)
-        assert row["settled"] is False and "starts under load" in row["notes"][0]
+        assert row["settled"] is False and "The record starts at 3" in row["notes"][0]
 
     def test_the_installed_command_has_the_others_behind_it(self, capsys, monkeypatch):
         monkeypatch.setattr(sys, "argv", ["battery-calibrate", "forecast", "running.csv"])

@@ -111,7 +111,7 @@ class TestRealCell:
         life = track_life([first, late, broken, fourth.until(2000.0), fourth], cut_off_V=3.2)
         assert life.table["valid"].tolist() == [True, False, False, False, True]
         starts, falls, short = life.table["reason"].iloc[1:4]
-        assert "starts under load" in starts and "the voltage falls to 2.00 V" in falls and "not known to 2 %" in short
+        assert "The record starts at 3" in starts and "the voltage falls to 2.00 V" in falls and "not known to 2 %" in short
         assert life.prior_q_mobile_C[0] == pytest.approx(track_life([first, fourth], 3.2).prior_q_mobile_C[0], rel=0.002)
         with pytest.raises(ValueError, match=r"Of 1 of 1: the voltage falls to 2\.00 V"):
             track_life([broken], cut_off_V=3.2)

@@ -28,7 +28,7 @@ from battery_env.estimators.diagnosis.faults import (
     table,
 )
 from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, LACKING_SHARE, low_rest_voltage_V, rest_voltage_V
-from battery_env.estimators.reasons import MOST_OF_SD, SETTLED_SHARES, Reason
+from battery_env.estimators.reasons import SETTLED_SHARES, Reason
 from battery_env.records import LOAD_SHARE, REST_CURRENT_A, STEADY_S, SWITCH_SHARE, ChargeBefore, ChargeHistory, Samples
 from battery_env.records.load import SWITCHES, note_switch, switched_C
 
@@ -51,19 +51,6 @@ _RECOVERY_SHARE = 0.2
 _BESIDE = 5
 # Switches between samples that leave more of the charge open than a settled estimate may tell no resistance.
 _MOST_SHARE = SETTLED_SHARES["q_mobile"]
-# What is said of a charge that nobody saw.
-_DOUBTS = np.array(
-    [
-        Reason.LOAD_ON_UNSURE,
-        Reason.REST_CURRENT,
-        Reason.TAPERED_EARLY,
-        Reason.UNCOUNTED,
-        Reason.MISSED,
-        Reason.Q_DROPPED,
-        Reason.Q_SWITCHES,
-        Reason.GAP,
-    ]
-)
 # Voltages are kept about this far apart, s: all that are kept cover the window in which a voltage may not rise.
 _KEPT_EVERY_S = 0.9
 
@@ -203,30 +190,21 @@ def measured(evidence: Any, initial_soc: float, clock_s: float = 0.0, charge: Ch
     """What texts say of samples, by the names in their braces, on a clock of its own."""
     charge, rest = charge or ChargeBefore(nan, nan, nan, nan), evidence["rest"]
     fault, switch, gap = evidence["fault"], evidence["switch"], evidence["gap"]
-    end_s, is_full = clock_s + gap["end_s"], initial_soc == 1.0
-    whole = "Give the whole discharge of a full cell, with the rest before it, or state initial_soc (--initial-soc)."
+    end_s = clock_s + gap["end_s"]
     return {
         "first_V": float(evidence["start"]["first_V"]),
         "rest_V": float(evidence["start_V"]),
-        "expected": "a full cell" if is_full else f"a cell with {initial_soc:.0%} of its charge",
-        "start_advice": whole if is_full else "State another initial_soc (--initial-soc).",
+        "first_A": float(evidence["start"]["first_A"]),
+        "expected": "a full cell" if initial_soc == 1.0 else f"a cell with {initial_soc:.0%} of its charge",
         "charge_V": charge.highest_V,
         "charge_A": charge.last_A,
-        "load_on_C": rest["load_on_C"],
         "offset_A": rest["mean_A"],
-        "offset_C": abs(rest["mean_A"]) * (evidence["time_s"] - rest["over_s"]),
         "fault_s": clock_s + (fault["time_s"] if fault["reason"] else switch["time_s"]),
         "size": fault["size"] if fault["reason"] else switch["size_A"],
-        "switched_C": float(switched_C(evidence["switches"])),
         "switches": evidence["switches"]["count"],
-        "uncounted_C": evidence["uncounted_C"],
-        "left_C": evidence["left_C"],
         "missed_C": evidence["missed_C"],
-        "dropped_C": evidence["dropped_C"],
-        "dropped_mohm": 1e3 * evidence["dropped_ohm"],
         "gap_start_s": end_s - gap["length_s"],
         "gap_end_s": end_s,
-        "gap_C": gap["charge_C"],
     }
 
 
@@ -325,15 +303,14 @@ def _rest_current_C(evidence: Row) -> float:
 
 
 @compiled
-def _doubts_C(evidence: Row) -> tuple[float, ...]:
-    # the standard deviations of the charge by all that nobody saw, in the order of _DOUBTS
+def charges_in_doubt_C(evidence: Row) -> tuple[float, ...]:
+    """The standard deviations of the charge by what nobody saw, in the order of ``Doubt``."""
     rest = evidence.rest
     return (
         rest.load_on_C if rest.is_over else 0.0,
         _rest_current_C(evidence),
         evidence.left_C,
         evidence.uncounted_C,
-        evidence.missed_C,
         evidence.dropped_C,
         0.0 if evidence.is_counted else switched_C(evidence.switches),
         gaps.doubtful_C(evidence),
@@ -342,9 +319,9 @@ def _doubts_C(evidence: Row) -> tuple[float, ...]:
 
 @compiled
 def unseen_C(evidence: Row) -> float:
-    """The standard deviation of the charge by all that nobody saw."""
-    variance_C2 = 0.0
-    for doubt_C in _doubts_C(evidence):
+    """The standard deviation of the charge by all that nobody saw, and that steps of the voltage show."""
+    variance_C2 = evidence.missed_C**2
+    for doubt_C in charges_in_doubt_C(evidence):
         variance_C2 += doubt_C**2
     return sqrt(variance_C2)
 
@@ -353,15 +330,6 @@ def unseen_C(evidence: Row) -> float:
 def is_smeared(evidence: Row) -> bool:
     """Whether the load is switched between samples so often that they do not tell which current a voltage belongs to."""
     return bool(switched_C(evidence.switches) > _MOST_SHARE * evidence.drawn_C)
-
-
-@compiled
-def doubt_reason(evidence: Row, sd_C: float) -> int:
-    """Say which charge that nobody saw makes most of a standard deviation of ``q_mobile``; 0 if none does."""
-    for number, doubt_C in enumerate(_doubts_C(evidence)):
-        if doubt_C > MOST_OF_SD * sd_C:
-            return int(_DOUBTS[number])
-    return 0
 
 
 @compiled
@@ -398,12 +366,10 @@ def start_reason(evidence: Row) -> int:
     """
     start = evidence.start
     if start.first_V > evidence.start_V + ABOVE_REST_V:
-        return Reason.START_ABOVE + 0
+        return Reason.START_DIFFERS + 0
     if start.charge < 0:
         return Reason.START_CHARGED + 0
-    if start.charge > 0 or not start.first_V < evidence.low_V:
-        return 0
-    return Reason.START_BELOW + 0 if start.first_A <= LOAD_SHARE * start.most_A else Reason.START_LOADED + 0
+    return Reason.START_DIFFERS + 0 if start.charge == 0 and start.first_V < evidence.low_V else 0
 
 
 @compiled

@@ -90,7 +90,7 @@ def soc_from_rest(
     fast_V, slow_V = (_running_mean_V(stream, count, memory_s) for memory_s in _MEMORIES_S)
     rest_V = _rest_voltages_V(cell)
     if not (np.diff(rest_V) > 0.0).all():
-        return Start(1.0, 0.0, count, Reason.REST_UNKNOWN.text)
+        return Start(1.0, 0.0, count, Reason.START_UNKNOWN.text)
     soc = float(np.interp(fast_V, rest_V, _SOC_GRID))
     around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
     slope_V = float(np.diff(np.interp(around, _SOC_GRID, rest_V))[0] / np.diff(around)[0])

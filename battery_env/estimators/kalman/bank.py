@@ -35,7 +35,15 @@ from battery_env.estimators.diagnosis.evidence import unseen_C
 from battery_env.estimators.diagnosis.faults import KEPT, Row
 from battery_env.estimators.kalman.state import FILTER, OFFSET, FilterSettings, Q, R
 from battery_env.estimators.reasons import Reason
-from battery_env.estimators.verdict import MISMATCH_MARGIN, MOST_NOISE_SD, PRIOR_LIMIT_SD, is_plausible, judge, note
+from battery_env.estimators.verdict import (
+    MISMATCH_MARGIN,
+    MOST_NOISE_SD,
+    PRIOR_LIMIT_SD,
+    is_plausible,
+    judge,
+    note,
+    note_about,
+)
 
 #: Standard deviations. Innovations count in full within the gate. A filter whose successive innovations are correlated, whose
 #: estimate leaves the range that it stated, or whose offset is beyond the stated one, by more than the limit does not follow
@@ -378,10 +386,10 @@ def conclude(cell: Row, settings: FilterSettings, estimate: Row) -> None:
             hidden_sd = hypot(bank.r_by_share * unseen_share, hypot(evidence.dropped_ohm, known.cell_sd_r_o))
         sd = hypot(hypot(max(own_sd, common_sd), known.gain_sd * value), hidden_sd)
         estimate.sd[k], estimate.own_sd[k], estimate.has_prior[k] = sd, sd, prior_sd > 0.0
-        note(estimate, Reason.Q_AT_BOUND + k, not low + own_sd < value < high - own_sd)
+        note_about(estimate, k, Reason.AT_BOUND, not low + own_sd < value < high - own_sd)
         if prior_sd > 0.0:
             narrowed = max(prior_sd**2 - own_sd**2, (_LEAST_NARROWING * prior_sd) ** 2)
-            note(estimate, Reason.Q_PRIOR_WRONG + k, (value - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed)
+            note_about(estimate, k, Reason.PRIOR_WRONG, (value - mean) ** 2 > PRIOR_LIMIT_SD**2 * narrowed)
             # precisions add up
             estimate.own_sd[k] = max(max(own_sd**-2.0 - prior_sd**-2.0, 0.0) ** -0.5, bank.common_sd[k])
     judge(estimate, evidence, known)

@@ -224,7 +224,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
                 self._begin(temperature_K)
         sample = np.array([(voltage_V, current_A, dt_s, temperature_K, current_A)], dtype=SAMPLE)
         (judged,) = self._follow(sample)
-        verdict = Verdict.of(judged["reason"].tolist(), judged["r_o_comes_first"], self._measured())
+        verdict = Verdict.of(judged, self._measured())
         (q_mobile, r_o), (sd_q_mobile, sd_r_o) = judged["value"].tolist(), judged["sd"].tolist()
         return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **verdict._asdict())
 
@@ -236,8 +236,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
 
     def _measured(self, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
         """What texts say, by the names in their braces."""
-        of_cell = {"of_cell_mohm": 1e3 * self._settings.known.cell_sd_r_o}
-        return measured(self._cell["evidence"], self.initial_soc[0], clock_s, charge) | of_cell
+        return measured(self._cell["evidence"], self.initial_soc[0], clock_s, charge)
 
     def follow(self, record: Record) -> EstimateTrace:
         """
@@ -259,11 +258,12 @@ class ExtendedKalmanFilter(OnlineEstimator):
         take_in(self._cell["evidence"], history)
         check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
         judged, said = self._follow(samples), self._measured(float(time_s[0]), history.charge)
-        first = list(zip(map(tuple, judged["reason"].tolist()), judged["r_o_comes_first"].tolist(), strict=True))
-        texts = {each: Verdict.of(each[0], each[1], said).reason for each in set(first)}
+        # the same is said again and again, at last with what is in doubt then
+        kinds = [each.tobytes() for each in judged[["reason", "about", "doubt", "r_o_comes_first"]]]
+        texts = {kind: Verdict.of(judged[n], said).reason for kind, n in {kind: n for n, kind in enumerate(kinds)}.items()}
         (q_mobile, r_o), (sd_q_mobile, sd_r_o) = judged["value"].T.copy(), judged["sd"].T.copy()
         settled_q, settled_r_o = (judged["reason"] == Reason.SETTLED).T
-        reasons = np.array([texts[each] for each in first], dtype=object)
+        reasons = np.array([texts[kind] for kind in kinds], dtype=object)
         settled = settled_q & settled_r_o
         return EstimateTrace(time_s, q_mobile, r_o, sd_q_mobile, sd_r_o, settled, reasons, settled_q, settled_r_o)
 
