@@ -219,23 +219,23 @@ def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:
     return {name: float(value) for name, value in summary.items()}
 
 
-def over_seeds(*tasks: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+def over_seeds(scores: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
-    What several trainings reached: the interquartile mean of their scores, and its 95 % interval by a stratified bootstrap, in
-    which the trainings of each task are drawn anew by themselves (Agarwal et al. 2021, Deep Reinforcement Learning at the Edge
-    of the Statistical Precipice). Of fewer than four scores the interquartile mean is the mean.
+    What several trainings reached: the interquartile mean of their scores, and its 95 % interval by a bootstrap (Agarwal et
+    al. 2021, Deep Reinforcement Learning at the Edge of the Statistical Precipice). Of fewer than four scores the
+    interquartile mean is the mean.
     """
     from scipy.stats import bootstrap, trim_mean  # slow to import, and nothing else here needs it
 
-    def interquartile_mean(*samples: FloatArray, axis: int = 0) -> FloatArray:
-        return np.asarray(trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis))
+    def interquartile_mean(sample: FloatArray, axis: int = 0) -> FloatArray:
+        return np.asarray(trim_mean(sample, 0.25, axis=axis))
 
-    scores = [np.asarray(task, dtype=np.float64) for task in tasks]
-    middle = interquartile_mean(*scores)
-    if min(len(task) for task in scores) < 2:
+    each = np.asarray(scores, dtype=np.float64)
+    middle = interquartile_mean(each)
+    if len(each) < 2:
         nothing = np.full_like(middle, np.nan)
         return middle, nothing, nothing
     interval = bootstrap(
-        scores, interquartile_mean, n_resamples=2000, axis=0, method="percentile", vectorized=True, random_state=0
+        (each,), interquartile_mean, n_resamples=2000, axis=0, method="percentile", vectorized=True, random_state=0
     ).confidence_interval
     return middle, np.asarray(interval.low), np.asarray(interval.high)

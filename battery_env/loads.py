@@ -13,16 +13,12 @@ from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_load, check_numbers, check_positive, check_range
-from battery_env.records import Record, drawn, is_load, load_span, resample_current, switches
-
-_MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
-#: The blocks of :class:`BlockBootstrap`, as a share of the record.
-BLOCK_SHARE = 0.1
+from battery_env.records import Record, is_load, load_span, resample_current, switches
 
 
 def _check_segments(total_s: float, name: str, shortest_s: float) -> None:
-    if total_s / shortest_s > _MOST_SEGMENTS:
-        raise ValueError(f"total_s and {name} make more than {_MOST_SEGMENTS:g} segments, got {total_s!r} and {shortest_s!r}")
+    if total_s / shortest_s > 1e6:  # then a time is meant in another unit
+        raise ValueError(f"total_s and {name} make more than 1e+06 segments, got {total_s!r} and {shortest_s!r}")
 
 
 class KnownLoad(ABC):
@@ -220,30 +216,6 @@ def constant(value: float, unit: LoadUnit = "power") -> Load:
     return Load(np.zeros(1), check_numbers("value", [value]), unit)
 
 
-def recorded(record: Record, unit: LoadUnit = "power", dt_s: float = 1.0) -> Load:
-    """
-    The load of a recorded discharge, from its first sample on; beyond the last one its last value goes on, so give the part
-    under load (:meth:`battery_env.Discharge.loaded_part`).
-
-    Between samples it runs as :func:`battery_env.records.drawn` has it. It is taken as its mean over each time step, which
-    keeps the drawn energy (power) or charge (current).
-
-    :param record: the discharge
-    :param unit: ``"power"`` (voltage times current) or ``"current"``
-    :param dt_s: time step of the simulation that is to follow it, s
-    :raises ValueError: for another unit, or a time step that is not positive or longer than the record
-    """
-    if unit not in ("power", "current"):
-        raise ValueError(f"unit must be 'power' (W) or 'current' (A), got {unit!r}")
-    time_s = np.asarray(record.time_s) - record.time_s[0]
-    check_positive("dt_s", dt_s)
-    if dt_s > time_s[-1]:
-        raise ValueError(f"dt_s must be at most the record's {time_s[-1]:g} s, got {dt_s!r}")
-    value = np.asarray(record.current_A * record.voltage_V if unit == "power" else record.current_A)
-    grid_s = dt_s * np.arange(int(time_s[-1] / dt_s + 1e-9) + 1, dtype=np.float64)
-    return Load(grid_s[:-1], np.diff(drawn(time_s, value, grid_s)) / dt_s, unit)
-
-
 @dataclass(frozen=True)
 class RandomPiecewise(RandomLoad):
     """
@@ -383,7 +355,7 @@ class BlockBootstrap(RandomLoad):
 
     @cached_property
     def _length(self) -> int:
-        block_s = self.block_s or BLOCK_SHARE * self.dt_s * len(self._values)
+        block_s = self.block_s or 0.1 * self.dt_s * len(self._values)
         return max(round(block_s / self.dt_s), 1)
 
     def __call__(self, rng: np.random.Generator) -> KnownLoad:

@@ -19,13 +19,11 @@ from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry.ends import BAND
-from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.cell_fit import CellFit
-from battery_env.estimators.cramer_rao import CramerRaoBound
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import over_seeds
 from battery_env.files import replacing
-from battery_env.parameters import PARAMETER_NAMES, PARAMETERS, Q_MOBILE, R_O
+from battery_env.parameters import PARAMETERS, Q_MOBILE, R_O
 from battery_env.records import Record
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import VoltageForecast
@@ -54,22 +52,12 @@ COLOUR_OF: Mapping[str, str] = {
 #: Of the axes of parameters.
 LABELS = {name: parameter.label for name, parameter in PARAMETERS.items()}
 
-# What an axis of estimates shows: all but this share at either end, and some room; the first estimates of a discharge can be
-# anything.
-_OUTLIERS = 0.02
-_ROOM = 0.35
-# Stretches of time whose extremes are drawn of a long record: more than a figure is wide in dots.
-_STRETCHES = 2000
-# A figure of a discharge in progress goes on for at most this many times its record, or its expected end.
-_LONGEST_SHOWN = 1.5
 # Title of the axis of each panel of a life, in the units of a lab, with the scale to them.
 _LIFE_COLUMNS = {
     "q_mobile_C": (f"{Q_MOBILE.symbol} (Ah)", 1.0 / 3600.0),
     "r_o_ohm": (rf"{R_O.symbol} (m$\Omega$)", 1e3),
     "drawn_Ah": ("charge drawn (Ah)", 1.0),
 }
-# Distance of the bars of cells, as a share of the axis.
-_BAR_STEP = 0.02
 _NAMES = re.compile("|".join(rf"\b{name}\b" for name in COLOUR_OF), flags=re.IGNORECASE)
 _COLOUR_OF_LOWER = {name.lower(): colour for name, colour in COLOUR_OF.items()}
 
@@ -196,8 +184,6 @@ def plot_discharge(
     """
     The measured voltage of one discharge with that of the model at some estimates, the current, and the error of the model.
 
-    Of a long record the least and the greatest value in each of 2000 stretches of time are drawn.
-
     :param record: one discharge, simulated or recorded
     :param forecasts: what :meth:`battery_env.RecordModel.forecast` made of estimates, by name for the legend
     :param title: of the figure
@@ -206,14 +192,13 @@ def plot_discharge(
     """
     figure = new_figure(6.4, 5.4)
     upper, middle, lower = panels = figure.subplots(3, 1, sharex=True, height_ratios=[5, 2, 3])
-    time_s, voltage_V = _drawn_points(record.time_s, record.voltage_V)
-    upper.plot(time_s, voltage_V, "o", ms=2.2, color=COLOUR_OF["measured"], label="measured")
-    middle.plot(*_drawn_points(record.time_s, record.current_A), color=COLOUR_OF["measured"], lw=1.2)
+    upper.plot(record.time_s, record.voltage_V, "o", ms=2.2, color=COLOUR_OF["measured"], label="measured")
+    middle.plot(record.time_s, record.current_A, color=COLOUR_OF["measured"], lw=1.2)
     lower.axhline(0.0, color="0.6", lw=0.8)
     for colour, (name, forecast) in coloured(forecasts.items()):
-        upper.plot(*_drawn_points(forecast.time_s, forecast.voltage_V), color=colour, lw=1.4, label=name)
+        upper.plot(forecast.time_s, forecast.voltage_V, color=colour, lw=1.4, label=name)
         error_mV = 1e3 * (forecast.at_samples_V - record.voltage_V)
-        lower.plot(*_drawn_points(record.time_s, error_mV), color=colour, lw=1.0, label=name)
+        lower.plot(record.time_s, error_mV, color=colour, lw=1.0, label=name)
     if end is not None:
         draw_end(upper, end)
     figure.suptitle(title, fontsize=10)
@@ -242,7 +227,8 @@ def draw_end(axes: Axes, expected: Expected) -> None:
     inside = f"{100.0 * (BAND[2] - BAND[0]):.0f} %"
     time_s, (low_V, median_V, high_V), end_s = expected.time_s, expected.voltage_V, expected.eod_quantile_s()
     if np.isfinite(end_s).all():
-        last_s = min(end_s[2], _LONGEST_SHOWN * max(time_s[0], end_s[1]))
+        # an end that may be far away would leave no room for what was seen
+        last_s = min(end_s[2], 1.5 * max(time_s[0], end_s[1]))
         axes.axvspan(min(end_s[0], last_s), last_s, color=COLOURS[1], alpha=0.2, lw=0, label=f"end of discharge, {inside}")
         axes.axvline(end_s[1], color=COLOURS[1], lw=1.2)
         seen = time_s <= last_s
@@ -266,7 +252,7 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
     for (upper, lower), discharge in zip(panels.T, discharges, strict=True):
         record = discharge.loaded_part(fit.cell.VEOD) if isinstance(discharge, Discharge) else discharge
         since_s = record.time_s - record.time_s[0]
-        upper.plot(*_drawn_points(since_s, record.voltage_V), "o", ms=2.2, color=COLOUR_OF["measured"], label="measured")
+        upper.plot(since_s, record.voltage_V, "o", ms=2.2, color=COLOUR_OF["measured"], label="measured")
         lower.axhline(0.0, color="0.6", lw=0.8)
         errors_mV = []
         for name, (cell, style, colour) in cells.items():
@@ -274,8 +260,8 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
             model_V = calibrator.model.voltage(record, calibrator.estimate(record))
             error_mV = 1e3 * (model_V - record.voltage_V)
             errors_mV.append(float(np.sqrt(np.nanmean(error_mV**2))))
-            upper.plot(*_drawn_points(since_s, model_V), style, color=colour, lw=1.3, label=f"model, constants {name} the fit")
-            lower.plot(*_drawn_points(since_s, error_mV), style, color=colour, lw=1.1)
+            upper.plot(since_s, model_V, style, color=colour, lw=1.3, label=f"model, constants {name} the fit")
+            lower.plot(since_s, error_mV, style, color=colour, lw=1.1)
         meta = getattr(record, "meta", {})
         name = literal(f"{meta['cell']}:{meta['cycle']}, ") if {"cell", "cycle"} <= set(meta) else ""
         upper.set_title(f"{name}RMSE {errors_mV[0]:.0f} → {errors_mV[1]:.0f} mV", fontsize=9)
@@ -286,26 +272,13 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
     return _finished(figure, *panels.ravel())
 
 
-def _drawn_points(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The points, or of many the least one of each stretch, then NaN, then the greatest: two lines, the envelope."""
-    if len(x) <= 2 * _STRETCHES:
-        return x, y
-    edges = np.linspace(0, len(x), _STRETCHES + 1).astype(np.int64)
-    parts = [y[low:high] for low, high in itertools.pairwise(edges)]
-    # NaN, where the model cell is empty, is neither least nor greatest; a stretch of nothing else stays a gap
-    least = edges[:-1] + np.array([np.where(np.isnan(part), np.inf, part).argmin() for part in parts])
-    greatest = edges[:-1] + np.array([np.where(np.isnan(part), -np.inf, part).argmax() for part in parts])
-    return np.concatenate([x[least], [np.nan], x[greatest]]), np.concatenate([y[least], [np.nan], y[greatest]])
-
-
 def plot_life(table: pd.DataFrame) -> Figure:
     """
-    What became of cells over their discharges: both parameters and the charge drawn, one line a cell. Estimates that are not
-    settled are hollow.
+    What became of cells over their discharges: both parameters and the charge drawn, one line a cell, with bars of two
+    standard deviations to either side. Estimates that are not settled are hollow, and have none.
 
     Most of the error of an estimate is that of the model or of a sensor, which all discharges of a cell share: it shifts a
-    line and does not bend it. It is drawn as one bar behind the line, of two median standard deviations. What the discharges
-    do not share shows in the scatter of the points.
+    line and does not bend it. What the discharges do not share shows in the scatter of the points.
 
     :param table: a row a discharge with ``cycle``, ``q_mobile_C``, ``sd_q_mobile_C``, ``r_o_ohm``, ``sd_r_o_ohm``,
         ``drawn_Ah`` and ``settled``, as the command line writes it, and if there are several cells with ``cell``. Where each
@@ -317,117 +290,31 @@ def plot_life(table: pd.DataFrame) -> Figure:
         raise ValueError(
             f"a life is drawn for one method, got {' and '.join(table['method'].unique())}: their r_o differ by up to a third"
         )
-    scales = {f"{sd}{column}": scale for column, (_, scale) in _LIFE_COLUMNS.items() for sd in ("", "sd_")}
-    table = table.assign(**{column: scale * table[column] for column, scale in scales.items() if column in table})
     figure = new_figure(6.8, 6.8)
     panels = figure.subplots(3, 1, sharex=True)
     one_each = "cell" not in table or not table["cell"].duplicated().any()
     cells = [("", table)] if one_each else list(table.groupby("cell", sort=False))
     is_numbered = all(rows["cycle"].notna().all() and not rows["cycle"].duplicated().any() for _, rows in cells)
-    lives = {
-        name: rows.set_index(rows["cycle"].astype(float) if is_numbered else np.arange(1.0, len(rows) + 1.0)).sort_index()
-        for name, rows in cells
-    }
-    width = np.ptp(np.concatenate([rows.index for rows in lives.values()]))
-    for number, (colour, (name, rows)) in enumerate(coloured(lives.items())):
-        bar_x = rows.index.max() + _BAR_STEP * width * (1 + number % len(COLOURS))
-        settled = rows[rows["settled"].astype(bool)]
-        for axes, column in zip(panels, _LIFE_COLUMNS, strict=True):
-            axes.plot(rows[column], color=colour, lw=0.8, alpha=0.6)
-            axes.plot(settled[column], "o", ms=2.6, color=colour, label=literal(str(name)))
-            axes.plot(rows[column].drop(settled.index), "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
-            if len(settled) and f"sd_{column}" in settled:
-                reach = 2.0 * settled[f"sd_{column}"].median()
-                axes.errorbar(bar_x, settled[column].iloc[-1], reach, fmt="none", color=colour, capsize=2.5, lw=1.2)
-    for axes, (column, (label, _)) in zip(panels, _LIFE_COLUMNS.items(), strict=True):
-        axes.set_ylabel(label)
-        if (sd := f"sd_{column}") in table:
-            values, reach = table[column].to_numpy(dtype=np.float64), 2.0 * table[sd].to_numpy(dtype=np.float64)
-            # the standard deviations of what is not settled may be of any size
-            reach[~table["settled"].to_numpy(dtype=np.bool_) | np.isnan(reach)] = 0.0
-            axes.set_ylim(*_limits([values - reach, values + reach]))
+    for colour, (name, of_cell) in coloured(cells):
+        number = of_cell["cycle"].astype(float) if is_numbered else np.arange(1.0, len(of_cell) + 1.0)
+        rows = of_cell.set_index(number).sort_index()
+        settled = rows["settled"].astype(bool)
+        for axes, (column, (label, scale)) in zip(panels, _LIFE_COLUMNS.items(), strict=True):
+            values = scale * rows[column]
+            reach = 2.0 * scale * rows[f"sd_{column}"][settled] if f"sd_{column}" in rows else None
+            axes.plot(values, color=colour, lw=0.8, alpha=0.6)
+            axes.plot(values[~settled], "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
+            shown = values[settled]
+            axes.errorbar(shown.index, shown, reach, fmt="o", ms=2.6, color=colour, elinewidth=0.4, label=literal(str(name)))
+            axes.set_ylabel(label)
     panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     panels[-1].set_xlabel("cycle" if is_numbered else "discharge")
-    _life_legend(figure, table)
+    figure.suptitle("bars: two standard deviations, mostly common to all points of a cell; hollow: not settled", fontsize=9)
+    if len(cells) > 1:
+        handles, labels = panels[0].get_legend_handles_labels()
+        named = slice(len(COLOURS))
+        figure.legend(handles[named], labels[named], loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return _finished(figure, *panels)
-
-
-def _life_legend(figure: Figure, table: pd.DataFrame) -> None:
-    axes = figure.axes[0]
-    named = [pair for pair in zip(*axes.get_legend_handles_labels(), strict=True) if pair[1]][: len(COLOURS)]
-    handles: list[Any] = [handle for handle, _ in named]
-    labels = [label for _, label in named]
-    if not table["settled"].astype(bool).all():
-        handles += axes.plot([], [], "o", ms=3.2, mfc="white", mec="0.25", mew=0.8)
-        labels.append("not settled")
-    handles.append(axes.errorbar([], [], [], fmt="none", color="0.4", capsize=2.5))
-    labels.append("± 2 sd, mostly common to all points of a cell")
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=9)
-
-
-def plot_estimates(
-    traces: Mapping[str, EstimateTrace],
-    true: Estimate | None = None,
-    bound: CramerRaoBound | None = None,
-) -> Figure:
-    """
-    Estimates during one discharge, one panel per parameter and one colour per calibrator, with bands of two stated standard
-    deviations to either side. Estimates that their calibrator does not take for settled are dotted.
-
-    :param traces: estimates of that discharge, by name of the calibrator
-    :param true: the true parameters, if they are known
-    :param bound: the least standard deviations that are possible, drawn around ``true``
-    :raises ValueError: for a bound without true parameters
-    """
-    if bound is not None and true is None:
-        raise ValueError("the bound is drawn around the true parameters: give them as `true`")
-    figure = new_figure(6.8, 2.4 * len(PARAMETER_NAMES) + 0.5)
-    panels = figure.subplots(len(PARAMETER_NAMES), 1, sharex=True)
-    for axes, parameter in zip(panels, PARAMETER_NAMES, strict=True):
-        shown = [getattr(trace, parameter) for trace in traces.values()]
-        if true is not None:
-            shown.append(np.array([getattr(true, parameter)]))
-            axes.axhline(getattr(true, parameter), color="0.25", lw=1.0, label="true")
-            if bound is not None:
-                _band(axes, bound.time_s, shown[-1], getattr(bound, f"sd_{parameter}"), "0.5", "Cramér-Rao bound, ± 2 sd")
-        for colour, (name, trace) in coloured(traces.items()):
-            _trace_line(axes, trace, parameter, colour, name)
-        axes.set(ylabel=LABELS[parameter], ylim=_limits(shown))
-        axes.ticklabel_format(useOffset=False)
-    panels[-1].set_xlabel("time (s)")
-    handles, labels = panels[0].get_legend_handles_labels()
-    if any(trace.settled is not None and not trace.settled.all() for trace in traces.values()):
-        handles += panels[0].plot([], [], ":", color="0.25")
-        labels.append("not settled yet")
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, fontsize=9)
-    return _finished(figure, *panels)
-
-
-def _trace_line(axes: Axes, trace: EstimateTrace, parameter: str, colour: str, name: str) -> None:
-    estimates, sd = getattr(trace, parameter), getattr(trace, f"sd_{parameter}")
-    if sd is not None:
-        _band(axes, trace.time_s, estimates, sd, colour)
-    settled = np.ones(len(estimates), dtype=np.bool_) if trace.settled is None else trace.settled
-    # a single estimate is no line
-    marker = "o" if len(estimates) == 1 else ""
-    axes.plot(trace.time_s, np.where(settled, estimates, np.nan), color=colour, lw=1.5, marker=marker, label=name)
-    if not settled.all():
-        # up to the next settled one, so that no gap is left
-        dotted = ~settled | np.append(~settled[1:], False) | np.append(False, ~settled[:-1])
-        axes.plot(trace.time_s, np.where(dotted, estimates, np.nan), ":", color=colour, lw=1.5, marker=marker)
-
-
-def _band(axes: Axes, time_s: FloatArray, middle: FloatArray, sd: FloatArray, colour: str, label: str | None = None) -> None:
-    # a standard deviation that is not finite is a band without a visible end
-    reach = np.where(np.isinf(sd), 1e3 * np.abs(middle).max(), 2.0 * sd)
-    axes.fill_between(time_s, middle - reach, middle + reach, color=colour, alpha=0.18, lw=0, label=label)
-
-
-def _limits(shown: Sequence[FloatArray]) -> tuple[float, float]:
-    ends = np.array([np.nanquantile(values, [_OUTLIERS, 1.0 - _OUTLIERS]) for values in shown])
-    low, high = float(ends.min()), float(ends.max())
-    room = max(_ROOM * (high - low), 1e-3 * abs(high))
-    return low - room, high + room
 
 
 def _finished(figure: Figure, *panels: Axes) -> Figure:

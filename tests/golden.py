@@ -48,7 +48,7 @@ def model() -> Numbers:
         "current": {"load": 2.0, "load_unit": "current"},
         "thermal": {"load": 12.0, "load_unit": "power", "thermal": True},
     }.items():
-        trajectory = simulate(q_mobile=6000.0, r_o=0.15, dt=1.0, until="eod", **arguments)
+        trajectory = simulate(q_mobile=6000.0, r_o=0.15, dt=1.0, **arguments)
         yield f"model/{name}/state", trajectory.state
         yield f"model/{name}/voltage", trajectory.voltage_V
     for aged, load in (("q_mobile", "paper"), ("r_o", "constant"), ("joint", "random_walk"), ("joint", "piecewise")):

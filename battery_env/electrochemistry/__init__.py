@@ -50,6 +50,4 @@ from battery_env.electrochemistry.simulation import initial_state as initial_sta
 from battery_env.electrochemistry.simulation import simulate as simulate
 from battery_env.electrochemistry.simulation import state_of_charge as state_of_charge
 from battery_env.electrochemistry.simulation import step as step
-from battery_env.electrochemistry.simulation import step_into as step_into
 from battery_env.electrochemistry.simulation import voltage as voltage
-from battery_env.electrochemistry.simulation import voltage_into as voltage_into

@@ -13,9 +13,18 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.cell import CellParameters, PackedConstants
-from battery_env.electrochemistry.kernels import BLOCK, BLOCK_SIZE, LOAD, VOLTAGE, fill_block, states_of_block, step_of_block
+from battery_env.electrochemistry.kernels import (
+    BLOCK,
+    BLOCK_SIZE,
+    LOAD,
+    VOLTAGE,
+    fill_block,
+    states_of_block,
+    step_of_block,
+    voltage_batch,
+)
 from battery_env.electrochemistry.model_error import memory_share
-from battery_env.electrochemistry.simulation import state_of_charge, voltage_into
+from battery_env.electrochemistry.simulation import state_of_charge
 
 #: The ends and the middle of the intervals that are shown: nine of ten outcomes lie between the outer two.
 BAND = (0.05, 0.5, 0.95)
@@ -28,7 +37,6 @@ SURPLUS_SHARE = 0.01
 _CHUNK_STEPS = 512
 # Rows of what is followed of cells: what they are, and the sum of their currents, the last current and voltage, and their end.
 _Q, _R_O, _ERROR, _DRIFT, _FIRST_SOC, _UNTIL, _SUM_A, _LAST_A, _LAST_V, _END, _END_SOC = range(11)
-_AT_FIRST = (0.0, np.nan, np.nan, np.inf, np.nan)
 
 
 class Model(Protocol):
@@ -161,7 +169,7 @@ def follow(cells: Cells, model: Model, current_A: FloatArray, shown: int) -> tup
     _run_on(current_A[None, :split], followed, run, packed, state, part_V)
     _run_on(current_A[None, split:], followed, run._replace(every=1), packed, state, part_V)
     at_end_V = np.empty(count)
-    voltage_into(at_end_V, state, cells.q_mobile, packed)
+    voltage_batch(state, cells.q_mobile, False, packed, at_end_V)
     voltage_V[:, :-1], voltage_V[:, -1] = part_V, at_end_V + cells.error_V
     return cells._replace(state=state), voltage_V
 
@@ -182,7 +190,7 @@ class _Run(NamedTuple):
 def _followed(cells: Cells, until: FloatArray) -> FloatArray:
     """What is followed of cells, at first."""
     known = (cells.q_mobile, cells.r_o, cells.error_V, cells.drift_V, cells.soc, until)
-    return np.vstack([*known, np.repeat(np.array(_AT_FIRST)[:, None], len(until), axis=1)])
+    return np.vstack([*known, np.repeat(np.array([0.0, np.nan, np.nan, np.inf, np.nan])[:, None], len(until), axis=1)])
 
 
 @compiled

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,8 +25,6 @@ from battery_env.electrochemistry.cell import (
 )
 from battery_env.electrochemistry.kernels import advance_batch, roll_out, step_batch, voltage_batch
 from battery_env.parameters import Q_MOBILE, R_O
-
-_MAX_STEPS = 1e8  # of one simulation, in memory
 
 
 def _aged(
@@ -81,7 +78,7 @@ def voltage(state: ArrayLike, q_mobile: ArrayLike | None = None, cell: CellParam
     x = _check_state(state)
     shape = np.broadcast_shapes(x.shape[:-1], q.shape)
     out = np.empty(int(np.prod(shape)))
-    voltage_into(out, _flat(x, shape, STATE_SIZE), _flat(q, shape), constants.packed)
+    voltage_batch(_flat(x, shape, STATE_SIZE), _flat(q, shape), False, constants.packed, out)
     return out.reshape(shape)[()]
 
 
@@ -115,34 +112,9 @@ def step(
     x, u = _check_state(state), check_load(load, load_unit)
     shape = np.broadcast_shapes(x.shape[:-1], u.shape, q.shape, r.shape)
     out = np.empty((int(np.prod(shape)), STATE_SIZE))
-    step_into(
-        out,
-        _flat(x, shape, STATE_SIZE),
-        _flat(u, shape),
-        _flat(q, shape),
-        _flat(r, shape),
-        check_dt(dt, constants),
-        load_unit,
-        thermal,
-        constants.packed,
-    )
+    x, u, q, r = _flat(x, shape, STATE_SIZE), _flat(u, shape), _flat(q, shape), _flat(r, shape)
+    step_batch(x, u, q, r, check_dt(dt, constants), load_unit == "power", thermal, False, constants.packed, out)
     return out.reshape((*shape, STATE_SIZE))
-
-
-def step_into(
-    out: FloatArray,
-    state: FloatArray,
-    load: FloatArray,
-    q_mobile: FloatArray,
-    r_o: FloatArray,
-    dt: float,
-    load_unit: LoadUnit,
-    thermal: bool,
-    packed: PackedConstants,
-    extended: bool = False,
-) -> None:
-    """:func:`step` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64."""
-    step_batch(state, load, q_mobile, r_o, dt, load_unit == "power", thermal, extended, packed, out)
 
 
 def advance_in_place(
@@ -157,17 +129,12 @@ def advance_in_place(
     thermal: bool,
     packed: PackedConstants,
 ) -> None:
-    """Advance every cell by its own number of steps under its own stretch of ``load``; unchecked, like :func:`step_into`."""
+    """Advance every cell by its own number of steps under its own stretch of ``load``, unchecked."""
     order = np.argsort(-steps)
     ordered = packed if len(packed.constants) == 1 else packed._replace(constants=packed.constants[order])
     ahead, power = state[order], load_unit == "power"
     advance_batch(ahead, load, first[order], steps[order], q_mobile[order], r_o[order], dt, power, thermal, ordered)
     state[order] = ahead
-
-
-def voltage_into(out: FloatArray, state: FloatArray, q_mobile: FloatArray, packed: PackedConstants) -> None:
-    """:func:`voltage` for inner loops: no checks, no broadcasting, no allocation; all arrays contiguous float64."""
-    voltage_batch(state, q_mobile, False, packed, out)
 
 
 def state_of_charge(state: FloatArray, q_mobile: FloatArray) -> FloatArray:
@@ -242,17 +209,6 @@ class Trajectory:
         )
 
 
-def _samples(until: Literal["eod"] | float, dt: float, max_duration_s: float) -> int:
-    """How many samples a simulation has at most."""
-    if until != "eod" and not (isinstance(until, (int, float)) and 0.0 < until <= max_duration_s):
-        raise ValueError(f"until must be 'eod' or a duration within 0 .. {max_duration_s:g} s, got {until!r}")
-    if not isinstance(max_duration_s, Real) or not 0.0 < max_duration_s / dt <= _MAX_STEPS:
-        raise ValueError(
-            f"max_duration_s must be greater than 0 and at most {_MAX_STEPS:g} steps of dt, got {max_duration_s!r}"
-        )
-    return int(np.floor((max_duration_s if until == "eod" else float(until)) / dt + 1e-9)) + 1
-
-
 def _loads(
     load: float | ArrayLike | Callable[[FloatArray], ArrayLike], unit: LoadUnit, dt: float, most_samples: int
 ) -> FloatArray:
@@ -276,14 +232,13 @@ def simulate(
     load: float | ArrayLike | Callable[[FloatArray], ArrayLike],
     q_mobile: float | None = None,
     r_o: float | None = None,
-    until: Literal["eod"] | float = "eod",
+    until: float = 86_400.0,
     dt: float = 1.0,
     load_unit: LoadUnit = "power",
     thermal: bool = False,
     cell: CellParameters | None = None,
     initial: ArrayLike | None = None,
     cut_off_V: float | None = None,
-    max_duration_s: float = 86_400.0,
 ) -> Trajectory:
     """
     Discharge one cell of a given age under a load, from full charge (or from ``initial``).
@@ -302,14 +257,13 @@ def simulate(
         that takes an array, and whose value at the start of each step holds for the step. Power in W or current in A
     :param q_mobile: charge that can move, C; ``None``: the cell's
     :param r_o: ohmic resistance, ohm; ``None``: the cell's
-    :param until: ``"eod"`` (the end of discharge) or a duration in s, whichever of the two comes first
+    :param until: where to stop if the discharge does not end before, s after the start
     :param dt: time step, s
     :param load_unit: ``"power"`` or ``"current"``
     :param thermal: whether the temperature moves
     :param cell: constants of the cell; ``None``: the new cell's
     :param initial: state at the start, shape (8,); ``None``: full charge at rest
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: the constants' ``VEOD``
-    :param max_duration_s: where to stop if the discharge does not end by itself (a load of zero), s
     :return: the samples down to the cut-off, and the time of the end of discharge
     :raises ValueError: for a value out of range
     """
@@ -317,7 +271,9 @@ def simulate(
     dt = check_dt(dt, constants)
     if q.ndim or r.ndim:
         raise ValueError(f"q_mobile and r_o must be single numbers, got shapes {q.shape} and {r.shape}")
-    loads = _loads(load, load_unit, dt, _samples(until, dt, max_duration_s))
+    if not isinstance(until, Real) or not 0.0 < until / dt <= 1e8:  # steps, which are held in memory
+        raise ValueError(f"until must be a time in s, greater than 0 and at most 1e8 steps of dt, got {until!r}")
+    loads = _loads(load, load_unit, dt, int(np.floor(until / dt + 1e-9)) + 1)
     n_samples = len(loads)
     start = initial_state(q, constants) if initial is None else _check_state(initial)
     if start.shape != (STATE_SIZE,):

@@ -57,8 +57,6 @@ VERSION = resources.files("battery_env").joinpath("version.txt").read_text(encod
 _FORMAT = "battery_env.run"
 # Discharges that could not be used have no values there.
 _TYPES = {"cycle": "Int64", "settled": "boolean", "settled_q_mobile": "boolean", "settled_r_o": "boolean"}
-# A scheduler that is there answers within milliseconds.
-_PATIENCE_S = 5
 # Warnings belong to the process: threads that catch them take turns.
 _CATCHING = threading.RLock()
 
@@ -155,7 +153,8 @@ def workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
         except ImportError as error:
             raise ImportError("--scheduler needs Dask: pip install 'battery_env[cluster]'") from error
         try:
-            client = Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
+            # one that is there answers within milliseconds
+            client = Client(scheduler, timeout=5, set_as_default=False)
         except (OSError, ValueError) as error:
             raise OSError(f"no Dask scheduler at {scheduler!r}: {error}") from error
         with client:

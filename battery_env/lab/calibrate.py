@@ -20,7 +20,6 @@ from typing_extensions import Unpack
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.electrochemistry import CellParameters
-from battery_env.electrochemistry.cell import TB
 from battery_env.electrochemistry.ends import quantile
 from battery_env.estimates import Estimate, last_estimate
 from battery_env.estimators.diagnosis.evidence import evidence_of, fault_reason, start_reason
@@ -42,19 +41,9 @@ from battery_env.records import STEADY_S, ExpectedCurrent, Samples, drawn, expec
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
-# A record of more samples than this is averaged over the time step of the model, or longer where it lasts longer than so many
-# steps: what lies between says nothing to the model.
+# A record of more samples than this is averaged over the time step of the model, 1 s, or longer where it lasts longer than so
+# many steps: what lies between says nothing to the model.
 _MANY_SAMPLES = 100_000
-_MODEL_STEP_S = 1.0
-# What is drawn after the cut-off is worth a word if it is more than this share of what was drawn before.
-_MORE_SHARE = 0.2
-# The model of a cell in air warms by 2 K at 2 A, where the bundled cells warm by 16 K: that alone moves q_mobile by less than
-# 0.1 %. What is farther off than this is another cell, load or chamber than these.
-_WARMTH_LIMIT_K = 20.0
-# So near to a bound, as a share of it, a search ended at it.
-_AT_BOUND = 1e-3
-# Nine of ten values of a normal distribution lie within so many standard deviations.
-_BAND_SD = 1.645
 
 
 class Options(SettingsOptions, total=False):
@@ -90,7 +79,7 @@ def calibrate(
 
     Where the start of a discharge is not known, or the voltage before the load contradicts it, where a sensor fails, or where
     nothing was drawn though the samples beside say so, its capacity is not known either. Its surroundings, and its temperature
-    at the start, are those measured at load-on; a model that departs far from the temperatures measured later is warned of.
+    at the start, are those measured at load-on.
 
     :param source: one discharge, whole or in progress; a table or a file of them, see :func:`battery_env.read_discharges`; or
         what the command takes: a folder, ``"life.csv:2"``, or a bundled cell, as ``"B0005:100"``
@@ -124,7 +113,6 @@ class _LoadedPart(NamedTuple):
     loaded: Discharge
     record: Discharge  # the same, of few samples
     fitted: Discharge  # the same, with the temperature that counts
-    averaged_over_s: float
     eod_time_s: float  # NaN: the record ends above the cut-off
     in_progress: bool
     more_C: float  # drawn after the end
@@ -151,7 +139,6 @@ def calibrated(
     cut_off_V, current_A = (-np.inf, 0.0) if part.in_progress else (settings.cut_off_V, part.load.mean_A)
     shown = model.forecast(part.record, estimate, cut_off_V, current_A)
     end = _end(part, estimate, replace(known, method=method), now or model, shown, load, samples, end_is_asked)
-    end_C, model_end_C = _end_temperatures(part.record, shown)
     charge = _charge(part, settings, estimate, end)
     if part.start.reason or part.more_C or not _is_all_logged(part, shown, estimate):
         charge = dict.fromkeys(charge, float("nan"))
@@ -172,7 +159,6 @@ def calibrated(
         initial_soc=part.start.soc,
         sd_initial_soc=part.start.sd_soc,
         samples=len(part.loaded.time_s),
-        averaged_over_s=part.averaged_over_s,
         load_on_time_s=float(part.record.time_s[0]),
         drawn_Ah=part.loaded.charge_C / 3600.0,
         **charge,
@@ -186,9 +172,6 @@ def calibrated(
         remaining_s=eod_s - float(part.record.time_s[-1]) if part.in_progress else 0.0,
         future_current_A=part.load.mean_A,
         load_varied=part.load.varied,
-        ambient_C=model.cell.Tb0 - ZERO_CELSIUS_K,
-        end_temperature_C=end_C,
-        model_end_temperature_C=model_end_C,
         settings=settings,
         record=part.record,
         forecast=shown,
@@ -200,13 +183,12 @@ def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
     """The part under load, how it starts, and what comes after it."""
     loaded, eod_time_s = discharge.loaded_part(settings.cut_off_V), discharge.eod_time_s(settings.cut_off_V)
     more_C = _charge_after(discharge, loaded, eod_time_s, settings.cut_off_V)
-    record, over_s = loaded, 0.0
+    record = loaded
     if len(loaded.time_s) > _MANY_SAMPLES:
-        over_s = max(_MODEL_STEP_S, float(loaded.time_s[-1] - loaded.time_s[0]) / _MANY_SAMPLES)
-        record = loaded.averaged(over_s)
+        record = loaded.averaged(max(1.0, float(loaded.time_s[-1] - loaded.time_s[0]) / _MANY_SAMPLES))
     cell, fitted = _cell_at_the_temperature(record, settings), record
-    if settings.ambient_C is not None or not settings.thermal:
-        # one that is stated, or held, counts more than one that was measured
+    if not settings.thermal:
+        # one that is held counts more than one that was measured
         discharge, fitted = discharge.without_temperature(), record.without_temperature()
     if settings.initial_soc == "rest":
         start = soc_from_rest(discharge, cell, settings.mismatch_V)
@@ -218,7 +200,6 @@ def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
         loaded=loaded,
         record=record,
         fitted=fitted,
-        averaged_over_s=over_s,
         eod_time_s=eod_time_s,
         in_progress=bool(np.isnan(eod_time_s)),
         more_C=more_C,
@@ -259,10 +240,8 @@ def _estimate(
 def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Estimate:
     """Without numbers where the search ended at its bound, as for a cell of far another size: a bound is no result."""
     low_C, high_C = settings.q_mobile_bounds_C
-    if (
-        "q_mobile" not in settings.parameters
-        or low_C < (1.0 - _AT_BOUND) * estimate.q_mobile < (1.0 - _AT_BOUND) ** 2 * high_C
-    ):
+    near = 1.0 - 1e-3  # to a bound: the search ended at it
+    if low_C < near * estimate.q_mobile < near**2 * high_C:
         return estimate
     nothing: dict[str, Any] = dict.fromkeys(("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"), float("nan"))
     reason = estimate.reason
@@ -340,7 +319,8 @@ def _middle(values: FloatArray, estimate: Estimate) -> tuple[float, float]:
     The median of samples, and the standard deviation that nine of ten of them show, if the estimate states one.
     """
     low, median, high = np.where(np.isfinite(values := quantile(values)), values, np.nan).tolist()
-    return median, (high - low) / (2.0 * _BAND_SD) if np.isfinite(estimate.sd_q_mobile) else float("nan")
+    # within 1.645 standard deviations, if they are of a normal distribution
+    return median, (high - low) / (2.0 * 1.645) if np.isfinite(estimate.sd_q_mobile) else float("nan")
 
 
 def _charge(part: _LoadedPart, settings: Settings, estimate: Estimate, end: Forecast | None) -> dict[str, float]:
@@ -359,14 +339,12 @@ def _charge(part: _LoadedPart, settings: Settings, estimate: Estimate, end: Fore
 
 def _cell_at_the_temperature(record: Discharge, settings: Settings) -> CellParameters:
     """
-    The constants of the model in the surroundings that are stated, measured at load-on, or known of the record. Those of a
-    path, or that a policy has learned of, hold at one temperature.
+    The constants of the model in the surroundings that were measured at load-on, or are known of the record. Those of a path,
+    or that a policy has learned of, hold at one temperature.
     """
-    cell, ambient_C = settings.constants, settings.ambient_C
-    if ambient_C is None and record.temperature_C is not None:
-        ambient_C = float(record.temperature_C[0])
-    elif ambient_C is None:
-        ambient_C = record.meta.get("ambient_temperature_C")
+    cell, ambient_C = settings.constants, record.meta.get("ambient_temperature_C")
+    if record.temperature_C is not None:
+        ambient_C = record.temperature_C[0]
     if ambient_C is None or settings.method == "policy" or settings.path is not None:
         return cell
     return cell.replace(Tb0=float(ambient_C) + ZERO_CELSIUS_K)
@@ -384,7 +362,7 @@ def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cu
         return 0.0
     until_C, in_all_C = drawn(discharge.time_s, discharge.current_A, [eod_time_s, discharge.time_s[-1]]).tolist()
     more_C = in_all_C - until_C
-    if more_C <= _MORE_SHARE * until_C:
+    if more_C <= 0.2 * until_C:
         return 0.0
     warnings.warn(
         f"{more_C / 3600.0:.3f} Ah more are drawn after the cut-off at {eod_time_s:.0f} s, and left aside. If that is "
@@ -414,21 +392,3 @@ def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
         return float("nan")
     # the cell is empty by then
     return float(model.capacity_Ah([constant(load_A, "current")], settings.cut_off_V)[0])
-
-
-def _end_temperatures(record: Discharge, forecast: VoltageForecast) -> tuple[float, float]:
-    """The last temperature measured, and the model's then; NaN if none was."""
-    if record.temperature_C is None:
-        return float("nan"), float("nan")
-    model_K = forecast.simulation.state[:, TB]
-    steps_s = forecast.simulation.dt_s * np.arange(len(model_K))
-    model_C = np.interp(record.time_s - record.time_s[0], steps_s, model_K) - ZERO_CELSIUS_K
-    departure_K = record.temperature_C - model_C
-    worst = int(np.abs(departure_K).argmax())
-    if abs(departure_K[worst]) > _WARMTH_LIMIT_K:
-        warnings.warn(
-            f"the cell is at {record.temperature_C[worst]:.0f} degC at {record.time_s[worst]:.0f} s, where the model is at "
-            f"{model_C[worst]:.0f} degC: its temperature does not hold for this cell or chamber",
-            stacklevel=4,
-        )
-    return float(record.temperature_C[-1]), float(model_C[-1])

@@ -43,9 +43,6 @@ SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141
 
 _NAME = "battery-calibrate"
 
-# So many discharges fit beside each other in the figure of a fit.
-_MOST_SHOWN = 4
-
 _QUANTITY = re.compile(r",\s*(?=\w+=)")
 
 
@@ -289,13 +286,6 @@ def _add_calibration(group: Any) -> None:
         help="nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this "
         "load); it also tells what to expect of a cell in progress that is below 1 or above 4 Ah",
     )
-    group.add_argument(
-        "--ambient",
-        dest="ambient_C",
-        type=float,
-        metavar="DEGC",
-        help="temperature of the surroundings, degC (default: the first one measured, or the model cell's 19 degC)",
-    )
 
 
 def calibrate(arguments: Sequence[str] | None = None) -> int:
@@ -434,7 +424,8 @@ def _fit(arguments: Sequence[str]) -> int:
 
     from battery_env.plotting import plot_cell_fit, save_figure  # here, as matplotlib takes long to import
 
-    shown = [discharges[n] for n in spread_over(len(discharges), _MOST_SHOWN)]
+    # so many fit beside each other
+    shown = [discharges[n] for n in spread_over(len(discharges), 4)]
     save_figure(plot_cell_fit(found, shown), picture)
     print(f"\nwritten: {out}, {picture}")
     return NOT_SETTLED if found.doubt else SETTLED

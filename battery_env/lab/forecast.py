@@ -23,15 +23,6 @@ from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.records import CUT_OFF_V, Record, Samples, check_record, expected_current
 from battery_env.records.model import RECENT_SHARE, RecordModel
 
-# The course of the voltage is kept about this often, s.
-_COURSE_S = 10.0
-# The last voltage of a record may be the cut-off but for rounding, V.
-_ROUNDING_V = 1e-6
-# The capacity of a new cell under a random load is the mean of so many draws, which makes it sure to 1 %.
-_NOMINAL_DRAWS = 100
-# An estimate this many standard deviations below what the record takes out of the cell contradicts the record.
-_CONTRADICTION_SD = 5.0
-
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -208,7 +199,8 @@ def forecast(
     else:
         cells = now.draws(samples, rng)._replace(drift_V=mismatch_V * rng.standard_normal(samples))
         r_ohm, voltage_V = cells.r_o, np.asarray(voltage(cells.state, cells.q_mobile, now.cell))
-    over = seen.voltage_V[-1] <= cut_off + _ROUNDING_V and seen.current_A[-1] > 0.0
+    reached_V = cut_off + 1e-6  # but for rounding
+    over = seen.voltage_V[-1] <= reached_V and seen.current_A[-1] > 0.0
     if not over:
         alive = np.flatnonzero(voltage_V + cells.error_V > cut_off)
         if len(alive) == 0:
@@ -225,15 +217,16 @@ def forecast(
     if over:
         given_Ah = (1.0 - cells.soc) * cells.q_mobile / 3600.0
         ends = Ends(np.zeros(samples), given_Ah, np.zeros(1), np.full((len(BAND), 1), cut_off))
-        above = np.flatnonzero(seen.voltage_V > cut_off + _ROUNDING_V)
+        above = np.flatnonzero(seen.voltage_V > reached_V)
         around = [above[-1] + 1, above[-1]] if len(above) else [0]
         now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
     else:
         now_s = float(seen.time_s[-1])
-        ends = run_down(cells, model, draws[-samples:], cut_off, _COURSE_S)
+        ends = run_down(cells, model, draws[-samples:], cut_off, every_s=10.0)
     if nominal_Ah is None:
-        # the mean over loads: under a single draw, health would be a matter of that draw. No charge takes a cell to its end
-        given_Ah = new.capacity_Ah(draws[:_NOMINAL_DRAWS], cut_off)
+        # the mean over loads, sure to 1 %: under a single draw, health would be a matter of that draw. No charge takes a cell
+        # to its end
+        given_Ah = new.capacity_Ah(draws[:100], cut_off)
         nominal_Ah = float(given_Ah[given_Ah > 0.0].mean()) if (given_Ah > 0.0).any() else float("nan")
     return Forecast(
         record=seen,
@@ -330,7 +323,7 @@ def _draw_parameters(
         raise ValueError(f"standard deviations must be at least 0, got {estimate!r}")
     least_C = max(model.least_q_mobile_C(current_A), Q_MOBILE.limits[0])
     low, high = np.log([least_C / q_C, Q_MOBILE.limits[1] / q_C])
-    if low > _CONTRADICTION_SD * share:
+    if low > 5.0 * share:  # standard deviations of its logarithm
         raise ValueError(
             f"the estimate contradicts the record, which takes a q_mobile of at least {least_C:.6g} C: got {q_C:.6g} +- "
             f"{share * q_C:.3g} C. Estimate anew from this record."

@@ -57,7 +57,6 @@ class Calibration:
     initial_soc: float = quantity("charge at the start", "%", 1, 100.0)
     sd_initial_soc: float = quantity("sd", "%", 1, 100.0)
     samples: int = quantity("samples")
-    averaged_over_s: float = quantity("averaged over", "s")
     load_on_time_s: float = quantity("load-on at", "s", 1)
     drawn_Ah: float = quantity("drawn", "Ah", 3)
     capacity_Ah: float = quantity("capacity", "Ah", 3)
@@ -73,9 +72,6 @@ class Calibration:
     remaining_s: float = quantity("remaining", "s")
     future_current_A: float = quantity("current to come", "A")
     load_varied: bool = quantity("load varied")
-    ambient_C: float = quantity("temperature at the start", "degC", 1)
-    end_temperature_C: float = quantity("temperature at the end", "degC", 1)
-    model_end_temperature_C: float = quantity("temperature of the model at the end", "degC", 1)
     record: Discharge | None = field(default=None, compare=False)
     forecast: VoltageForecast | None = field(default=None, compare=False)
     end: Forecast | None = field(default=None, compare=False)
@@ -114,8 +110,8 @@ class Calibration:
 
     @property
     def settled_alone(self) -> str:
-        """The parameter that is settled though the other one, which was searched for as well, is not; empty if none is."""
-        known = [f"settled_{name}" for name in self.settings.parameters if getattr(self, f"settled_{name}")]
+        """The parameter that is settled though the other one is not; empty if none is."""
+        known = [name for name in ("settled_q_mobile", "settled_r_o") if getattr(self, name)]
         return "" if self.settled else "".join(_HOW[name]["text"] for name in known)
 
     @property
@@ -142,10 +138,8 @@ _IN_A_LINE = (
 
 def text_of(name: str, found: Calibration) -> str:
     """What a discharge says, for reading."""
-    averaged = f", averaged over {found.averaged_over_s:g} s," if found.averaged_over_s else ""
     lines = [
-        f"{name}: {found.samples} samples{averaged} from load-on at {found.shown('load_on_time_s')}, "
-        f"{found.shown('drawn_Ah')} drawn"
+        f"{name}: {found.samples} samples from load-on at {found.shown('load_on_time_s')}, {found.shown('drawn_Ah')} drawn"
     ]
     if found.method != "least-squares":
         lines.append(f"calibrated by {_CALIBRATED_BY[found.method]}")
@@ -168,15 +162,12 @@ def _rows_of_text(found: Calibration) -> Iterator[tuple[str, str]]:
         sd = f"sd {found.shown(f'sd_{column}')}" if found.sd_of(column) else "no sd stated"
         value, sd_value, needed = getattr(found, column), getattr(found, f"sd_{column}"), SETTLED_SHARES[parameter]
         too_wide = f", {sd_value / value:.0%}: settled below {needed:.0%}" if sd_value > needed * value > 0.0 else ""
-        yield column, f"{sd}{too_wide}" if parameter in found.settings.parameters else "held"
+        yield column, f"{sd}{too_wide}"
     yield "settled", f"only {found.settled_alone} is" if found.settled_alone else ""
     yield "drawn_Ah", _of_the_charge(found)
     if not np.isnan(found.nominal_Ah):
         yield "state_of_health", _of_the_health(found)
     yield "voltage_rmse_V", ""
-    if not np.isnan(found.end_temperature_C):
-        model = f"{found.shown('ambient_C')} to {found.shown('model_end_temperature_C')}"
-        yield "end_temperature_C", f"measured; the model goes from {model}"
     yield "predicted_eod_time_s", ""
     if found.in_progress:
         yield "remaining_s", _of_the_load(found)
@@ -205,8 +196,7 @@ def _of_the_health(found: Calibration) -> str:
 
 
 def _of_the_load(found: Calibration) -> str:
-    is_sure = "q_mobile" in found.settings.parameters and found.sd_of("predicted_eod_time_s")
-    sd = f"sd {found.shown('sd_predicted_eod_time_s')}, " if is_sure else ""
+    sd = f"sd {found.shown('sd_predicted_eod_time_s')}, " if found.sd_of("predicted_eod_time_s") else ""
     goes_on = "on average, as so far, an assumption: the load varied" if found.load_varied else "to go on"
     return f"{sd}{found.future_current_A:.3g} A {goes_on}"
 
@@ -225,7 +215,7 @@ def title_of(name: str, found: Calibration) -> str:
     """The same above a figure."""
     parts = []
     for parameter, column in _COLUMN_OF.items():
-        spread = f"sd {found.sd_of(column)}" if found.sd_of(column) else "held"
-        parts.append(f"{PARAMETERS[parameter].symbol} {found.shown(column)} ({spread})".replace("mohm", r"m$\Omega$"))
+        sd = found.sd_of(column) or "not stated"
+        parts.append(f"{PARAMETERS[parameter].symbol} {found.shown(column)} (sd {sd})".replace("mohm", r"m$\Omega$"))
     parts += [f"{found.shown('drawn_Ah')} drawn", f"RMSE {found.shown('voltage_rmse_V', 0)}"]
     return f"{name}: {found.state}\n{', '.join(parts)}"

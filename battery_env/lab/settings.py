@@ -20,7 +20,7 @@ from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.kalman.filter import PRIOR_SD_SHARE_Q, ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import Reason
-from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE
+from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import CUT_OFF_V
 
@@ -30,32 +30,17 @@ METHODS: tuple[Method, ...] = get_args(Method)
 # Constants that were fitted at one load moved q_mobile by 5 % at twice that load, and so by less than the 2 % of a settled
 # estimate within this ratio.
 _SAME_LOAD = 1.25
-_AMBIENT_LIMITS_C = (-60.0, 100.0)
-# What a policy cannot be told: it has learned on one model, a new 18650.
-_NOT_FOR_POLICIES = (
-    "cell",
-    "parameters",
-    "prior_q_mobile_C",
-    "mismatch_V",
-    "current_gain_sd",
-    "ambient_C",
-    "initial_soc",
-)
-# Nor may be said beside a path: it tells which of all go together, at the temperature of its lives.
-_NOT_WITH_PATH = ("parameters", "ambient_C")
 
 
 class SettingsOptions(TypedDict, total=False):
     """Keywords of :class:`Settings`."""
 
     method: Method | None
-    parameters: tuple[str, ...]
     cut_off_V: float | None
     prior_q_mobile_C: tuple[float, float] | None
     mismatch_V: float | None
     current_gain_sd: float
     thermal: bool | None
-    ambient_C: float | None
     nominal_Ah: float | None
     cell: CellFit | AgingPath | CellParameters | None
     cell_rates_sd: Mapping[str, float] | None
@@ -71,14 +56,11 @@ class Settings:
     :param method: of calibration; ``None``: the filter for a record in progress at a constant load that goes on, of a cell of
         which neither a prior nor the constants are known, and else least squares. ``"policy"`` is the one that comes with the
         package, for both parameters; its model is a new 18650 at constant temperature
-    :param parameters: which to search for; the other is held at the cell's value
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: where that of the fit of ``cell`` does, or 2.7
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
     :param mismatch_V: error to expect of the model itself, V; ``None``: that of the fit of ``cell``, or 0.05
     :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
     :param thermal: whether the temperature of the model moves; ``None``: as in the fit of ``cell``, or that it does
-    :param ambient_C: temperature at the start and of the surroundings, degC; ``None``: the first one measured, or what
-        else the record says of its surroundings, or the cell's
     :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: the charge that ``cell``, with its
         own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``.
         Where nothing else is known, it tells the ``q_mobile`` of a cell of another size than a new 18650, in progress
@@ -95,13 +77,11 @@ class Settings:
     """
 
     method: Method | None = None
-    parameters: tuple[str, ...] = PARAMETER_NAMES
     cut_off_V: float = None  # type: ignore[assignment]  # it is a number as soon as the settings are made
     prior_q_mobile_C: tuple[float, float] | None = None
     mismatch_V: float = None  # type: ignore[assignment]
     current_gain_sd: float = 0.005
     thermal: bool = None  # type: ignore[assignment]
-    ambient_C: float | None = None
     nominal_Ah: float | None = None
     cell: CellFit | AgingPath | CellParameters | None = None
     cell_rates_sd: Mapping[str, float] | None = None
@@ -112,26 +92,24 @@ class Settings:
             raise ValueError(f"the method is {' or '.join(METHODS)}, got {self.method!r}")
         if self.nominal_Ah is not None:
             check_positive("the nominal capacity in Ah", self.nominal_Ah)
-        low, high = _AMBIENT_LIMITS_C
-        if self.ambient_C is not None and not low <= self.ambient_C <= high:
-            raise ValueError(f"the ambient temperature must lie within {low:g} .. {high:g} degC, got {self.ambient_C!r}")
         for name, value in self._known_of_the_cell().items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
-        if self.path is not None:
-            if self.method not in (None, "least-squares"):
-                raise ValueError(f"a path of aging cells is for least squares, got the method {self.method!r}")
-            self._refuse_stated(_NOT_WITH_PATH, "a path of aging cells", "leave the path out")
+        if self.path is not None and self.method not in (None, "least-squares"):
+            raise ValueError(f"a path of aging cells is for least squares, got the method {self.method!r}")
         if self.method == "policy":
-            self._refuse_stated(_NOT_FOR_POLICIES, "the policy that comes with the package", "take another method")
+            self._refuse_for_the_policy()
         if not 0.0 < self.cut_off_V < np.inf:
             raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
 
-    def _refuse_stated(self, names: tuple[str, ...], what: str, other: str) -> None:
+    def _refuse_for_the_policy(self) -> None:
+        """Refuse what a policy cannot be told: it has learned on one model, a new 18650."""
         defaults = {field.name: field.default for field in fields(self)} | self._known_of_the_cell()
-        for name in names:
+        for name in ("cell", "prior_q_mobile_C", "mismatch_V", "current_gain_sd", "initial_soc"):
             if getattr(self, name) != defaults[name]:
-                raise ValueError(f"{what} takes no {name}: leave it out, or {other}")
+                raise ValueError(
+                    f"the policy that comes with the package takes no {name}: leave it out, or take another method"
+                )
 
     def _known_of_the_cell(self) -> dict[str, Any]:
         """What the cell tells where nothing else is stated."""
@@ -187,7 +165,7 @@ class Settings:
 
     def with_nominal_prior(self) -> Settings:
         """What a nominal capacity tells of a cell of another size than a new 18650, of which nothing else is known."""
-        is_known = self.prior_q_mobile_C is not None or self.cell is not None or "q_mobile" not in self.parameters
+        is_known = self.prior_q_mobile_C is not None or self.cell is not None
         if self.nominal_Ah is None or is_known or self.method == "policy":
             return self
         q_mobile_C = float(np.clip(UNDELIVERED * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
@@ -225,7 +203,6 @@ class Settings:
             return PolicyEstimator.pretrained(recorded=True)
         stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
         common: dict[str, Any] = {
-            "parameters": self.parameters,
             "cell": cell or self.constants,
             "thermal": self.thermal,
             "prior_q_mobile_C": self.prior_q_mobile_C,
@@ -240,8 +217,7 @@ class Settings:
         # constants that are anybody's, once they are free, explain as much of the error as q_mobile and r_o absorb
         is_explained = rates_sd is RATE_PRIOR_SD
         mismatch_V = self.mismatch_V / WHOLE_ERROR if is_explained else self.mismatch_V
-        nuisance = {name: sd for name, sd in rates_sd.items() if name != "tDiffusion" or "q_mobile" in self.parameters}
-        return LeastSquares(mismatch_V=mismatch_V, nuisance=nuisance, path=self.path, **common)
+        return LeastSquares(mismatch_V=mismatch_V, nuisance=rates_sd, path=self.path, **common)
 
     def _rates_sd(self) -> Mapping[str, float]:
         """

@@ -201,7 +201,7 @@ class RecordModel:
             cell=self.cell,
             initial=self.start(q_mobile),
             cut_off_V=-np.inf,
-            max_duration_s=len(current_A) * self.dt_s,
+            until=len(current_A) * self.dt_s,
         )
 
     def voltage(self, record: Record, at: Estimate) -> FloatArray:

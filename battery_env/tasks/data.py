@@ -11,20 +11,14 @@ import numpy as np
 
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
-from battery_env.loads import Load, LoadSampler, RandomPiecewise, RandomWalk, constant, recorded
-from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
+from battery_env.loads import Load, LoadSampler, RandomPiecewise, RandomWalk, constant
 from battery_env.trajectories import PAPER_LOADS_W, PAPER_RANGES, PAPER_TRIM, TrajectoryDataset, aged_parameters
 
 _Discharges = TypeVar("_Discharges")
 
-LoadKind = Literal["paper", "constant", "piecewise", "random_walk", "recorded"]
+LoadKind = Literal["paper", "constant", "piecewise", "random_walk"]
 Split = Literal["train", "test", "all"]
 
-#: Discharges in a data set, but for the paper's.
-DISCHARGES = 1000
-#: Seed of ages, loads and of the division into train and test: all data sets of a parameter hold the same cells.
-SEED = 0
-TEST_SHARE = 0.3
 #: Ages of the cells that discharge under other loads than the paper's, C and ohm.
 Q_MOBILE_RANGE_C = (4000.0, 7600.0)
 R_O_RANGE_OHM = (0.1, 0.3)
@@ -52,7 +46,6 @@ def standard_dataset(
     ``constant``    thirteen constant loads, 2 to 8 W                              4000-7600 C  0.1-0.3 ohm    1000
     ``piecewise``   2 to 8 W, uniform, changed every 60 to 140 s                   4000-7600 C  0.1-0.3 ohm    1000
     ``random_walk`` 2 to 8 W, changed every 60 s by at most 2 W                    4000-7600 C  0.1-0.3 ohm    1000
-    ``recorded``    the power of the 336 discharges of the bundled cells, 5 to 9 W 4000-7600 C  0.1-0.3 ohm    1000
     =============== ============================================================== ============ ============== ==========
 
     ``paper`` is trimmed to 5 .. 95 % of each discharge and, for one parameter of the new cell at 1 s without mismatch, the
@@ -87,25 +80,23 @@ def _splits(
     cell: CellParameters,
     path: AgingPath | None,
 ) -> dict[Split, TrajectoryDataset]:
+    count, seed = 1000, 0  # of ages, loads and the division: all data sets of a parameter hold the same cells
     if path is not None:
-        whole = TrajectoryDataset.along(path, DISCHARGES, _loads(load, dt_s), SEED, dt_s)
+        whole = TrajectoryDataset.along(path, count, _loads(load), seed, dt_s)
     elif load == "paper" and len(parameters) == 1 and dt_s == 1.0 and mismatch == 0.0 and cell == NEW_CELL:
         whole = TrajectoryDataset.paper(parameters[0])
     else:
         ranges = PAPER_RANGES if load == "paper" else {"q_mobile": Q_MOBILE_RANGE_C, "r_o": R_O_RANGE_OHM}
-        q_C, r_ohm, loads = ranges["q_mobile"], ranges["r_o"], _loads(load, dt_s)
-        whole = TrajectoryDataset.generate(parameters, DISCHARGES, loads, SEED, q_C, r_ohm, dt_s, cell=cell, mismatch=mismatch)
+        q_C, r_ohm, loads = ranges["q_mobile"], ranges["r_o"], _loads(load)
+        whole = TrajectoryDataset.generate(parameters, count, loads, seed, q_C, r_ohm, dt_s, cell=cell, mismatch=mismatch)
         whole = whole.trimmed(*PAPER_TRIM) if load == "paper" else whole
-    train, test = whole.split(test=TEST_SHARE, seed=SEED)
+    train, test = whole.split(test=0.3, seed=seed)
     return {"train": train, "test": test, "all": whole}
 
 
-def _loads(load: LoadKind, dt_s: float) -> list[Load] | LoadSampler:
+def _loads(load: LoadKind) -> list[Load] | LoadSampler:
     if load == "piecewise":
         return RandomPiecewise()
     if load == "random_walk":
         return RandomWalk()
-    if load == "recorded":
-        discharges = (discharge for cell in BUNDLED_CELLS for discharge in load_nasa_discharges(cell))
-        return [recorded(discharge.loaded_part(NEW_CELL.VEOD), "power", dt_s) for discharge in discharges]
     return [constant(power) for power in (PAPER_LOADS_W if load == "paper" else CONSTANT_LOADS_W)]

@@ -29,8 +29,8 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
     :param task: the class of the task, or where it is, as ``"module:name"``
     :param num_envs: number of cells
     :param autoreset_mode: when a cell whose episode is over is started again: ``NEXT_STEP``: by the step that follows, whose
-        action does nothing to it; ``SAME_STEP``: at once, with ``final_obs`` and ``final_info`` in ``info``; ``DISABLED``: by
-        the caller, with ``reset(options={"reset_mask": ...})``. The mode or its value, a string
+        action does nothing to it; ``SAME_STEP``: at once, with ``final_obs`` and ``final_info`` in ``info``. The mode or its
+        value, a string
     :param options: of the task
     :raises TypeError: for an option that the task does not have
     :raises ValueError: for values out of range
@@ -49,6 +49,8 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
             raise ValueError(f"num_envs must be at least 1, got {num_envs!r}")
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            raise ValueError("autoreset_mode must be 'NextStep' or 'SameStep', got 'Disabled'")
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.task = new_task(task, num_envs, options)
         self.single_observation_space, self.single_action_space = spaces_of(self.task)
@@ -61,31 +63,27 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """
-        Start an episode in every cell, or in some.
+        Start an episode in every cell.
 
         :param seed: seed of this and the following episodes: one a cell, or the first cell's, from which the others count up
-        :param options: choices that replace random draws; the page of the environment names them. ``reset_mask``, shape
-            (num_envs,), says which cells to start, all by default
+        :param options: choices that replace random draws; the page of the environment names them
         :return: observations, info
-        :raises ValueError: for a wrong number of seeds, or a mask that is none
+        :raises ValueError: for a wrong number of seeds
         """
-        chosen = dict(options or {})
-        mask = self._checked_mask(chosen.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
         if seed is None or isinstance(seed, (int, np.integer)):
             seeds: list[int | None] = [None if seed is None else int(seed) + n for n in range(self.num_envs)]
         else:
             seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed must be one number, or one for each of the {self.num_envs} cells, got {len(seeds)}")
-        if not self._generators:
-            self._generators = [seeding.np_random(value)[0] for value in seeds]
-        else:
-            for n in np.flatnonzero(mask):
-                if seeds[n] is not None:
-                    self._generators[n] = seeding.np_random(seeds[n])[0]
-        self._start(mask, chosen)
-        self._over = self._over & ~mask
-        return self.task.observation(), self._info(np.zeros(self.num_envs), mask)
+        before = self._generators or [None] * self.num_envs
+        self._generators = [
+            seeding.np_random(value)[0] if generator is None or value is not None else generator
+            for generator, value in zip(before, seeds, strict=True)
+        ]
+        self._over = np.zeros(self.num_envs, dtype=np.bool_)
+        self._start(~self._over, options)
+        return self.task.observation(), self._info(np.zeros(self.num_envs))
 
     def step(self, actions: NDArray[np.float32]) -> tuple[NDArray[np.float32], FloatArray, Mask, Mask, dict[str, Any]]:
         """
@@ -93,17 +91,14 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
 
         :param actions: shape (num_envs, number of parameters), in [-1, 1]
         :return: observations, rewards (minus the cost), terminated (never), truncated (end of an episode or of its data), info
-        :raises gymnasium.error.ResetNeeded: before the first reset; without autoreset, if an episode is over
+        :raises gymnasium.error.ResetNeeded: before the first reset
         """
         if not self._generators:
             raise gym.error.ResetNeeded("call reset() before step()")
-        if self.autoreset_mode is AutoresetMode.DISABLED and self._over.any():
-            cells = np.flatnonzero(self._over).tolist()
-            raise gym.error.ResetNeeded(f"the episodes of cells {cells} are over: start them with reset_mask before step()")
         cost = self.task.advance(actions)
         reward, truncated, final = -cost, self.task.truncated(), {}
         started = None
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._over.any():
+        if self._over.any():
             started = self._over
             self._start(started)
             reward[started], truncated[started] = 0.0, False
@@ -113,17 +108,10 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
             self._start(started)
         if started is not None:
             cost[started] = 0.0
-        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._over = truncated.copy()
         info = {**final, **self._info(cost)}
         return self.task.observation(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, info
-
-    def _checked_mask(self, mask: Any) -> Mask:
-        if not (isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,) and mask.any()):
-            raise ValueError(
-                f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},), not all False, got {mask!r}"
-            )
-        return mask
 
     def _start(self, mask: Mask, options: Mapping[str, Any] | None = None) -> None:
         rows = np.flatnonzero(mask)

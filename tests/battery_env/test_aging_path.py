@@ -10,7 +10,7 @@ import pytest
 
 from battery_env import AgingPath, LeastSquares, PolicyEstimator, TrajectoryDataset, calibrate, evaluate, fit_life
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
-from battery_env.electrochemistry.aging_path import BEYOND_SHARE, PATH_NAMES, SPREAD_SD, cell_with
+from battery_env.electrochemistry.aging_path import PATH_NAMES, SPREAD_SD, cell_with
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.estimates import last_estimate
 from battery_env.lab.command_line import SETTLED
@@ -107,8 +107,8 @@ class TestFit:
 class TestDraw:
     def test_cells_lie_along_the_path_and_a_little_beyond_and_beside_it(self, path):
         cells = path.draw(4000, seed=0)
-        assert cells.place.min() == pytest.approx(-BEYOND_SHARE, abs=0.01)
-        assert cells.place.max() == pytest.approx(1.0 + BEYOND_SHARE, abs=0.01)
+        assert cells.place.min() == pytest.approx(-0.2, abs=0.01)
+        assert cells.place.max() == pytest.approx(1.2, abs=0.01)
         middle = np.abs(cells.place - 0.5) < 0.02
         rows = np.array(path.lives[0])
         assert np.log(cells.q_mobile[middle]).mean() == pytest.approx(rows[AGES // 2, -2], abs=0.02)
@@ -281,17 +281,9 @@ class TestCalibrations:
             found = calibrate(discharges[-1].until(1500.0), known)
             assert abs(found.predicted_eod_time_s - end_s) < most * end_s
 
-    @pytest.mark.parametrize(
-        ("options", "message"),
-        [
-            ({"method": "kalman"}, "is for least squares"),
-            ({"parameters": ("r_o",)}, "takes no parameters"),
-            ({"ambient_C": 24.0}, "takes no ambient_C"),
-        ],
-    )
-    def test_what_a_path_tells_is_not_said_twice(self, path, options, message):
-        with pytest.raises(ValueError, match=message):
-            Settings(cell=path, **options)
+    def test_a_path_is_for_least_squares(self, path):
+        with pytest.raises(ValueError, match="is for least squares"):
+            Settings(cell=path, method="kalman")
 
 
 #: It leaves the estimate where the fit in its observation puts it.

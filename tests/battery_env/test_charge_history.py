@@ -201,8 +201,9 @@ class TestCutOff:
     def test_capacity_is_that_of_the_first_load_that_ends_there(self, stop_V, later_A):
         """Rate steps: each smaller load draws some more."""
         parts, state, now_s = [([0.0], [4.19], [0.0])], None, 10.0
-        for load_A, until in ((3.0, "eod"), *((A, "eod") if A else (A, 900.0) for later in later_A for A in (0.0, later))):
-            made = simulate(load_A, 6800.0, 0.12, until, load_unit="current", cut_off_V=stop_V, initial=state)
+        for load_A in (3.0, *(A for later in later_A for A in (0.0, later))):
+            until_s = 86_400.0 if load_A else 900.0
+            made = simulate(load_A, 6800.0, 0.12, until_s, load_unit="current", cut_off_V=stop_V, initial=state)
             kept = np.append(np.arange(0, len(made.time_s) - 1, 5), len(made.time_s) - 1)
             parts.append((now_s + made.time_s[kept], made.voltage_V[kept], np.full(len(kept), load_A)))
             state, now_s = made.state[-1], now_s + made.time_s[-1] + 1.0

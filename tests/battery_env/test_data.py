@@ -40,14 +40,6 @@ def test_ages_span_their_ranges():
     assert set(data.load_values) == set(np.linspace(2.0, 8.0, 13))
 
 
-def test_recorded_loads_are_the_power_of_the_bundled_cells():
-    data = standard_dataset(BOTH, "recorded", "all")
-    mean = np.array([trajectory.load.mean() for trajectory in data[::20]])
-    assert 250 < len(np.unique(data.load_start)) <= 336
-    assert 6.0 < mean.min() and mean.max() < 8.0 and 5.0 < data.load_values.min() and data.load_values.max() < 9.0
-    assert data.samples.min() > 1000 and (data.eod_time_s == data.samples).all() and (data.first == 0).all()
-
-
 @pytest.mark.parametrize("load", ["piecewise", "random_walk"])
 def test_changing_loads_change_within_their_bounds(load):
     values = standard_dataset(BOTH, load, "all")[0].load

@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from battery_env import NEW_CELL, CellParameters, initial_state, simulate, step, voltage
-from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, advance_in_place, state_of_charge, step_into, voltage_into
+from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, advance_in_place, state_of_charge
 from battery_env.electrochemistry.cell import new_cell_of
+from battery_env.electrochemistry.kernels import step_batch, voltage_batch
 
 # Tb, Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V of a new cell, dt 1 s
 REFERENCE_2A_THERMAL = {
@@ -94,7 +95,7 @@ def test_a_cell_comes_out_the_same_in_a_batch_of_any_size_and_on_its_own_way(loa
         state = initial_state(q)
         advance_in_place(state, loads, first, steps, q, r, 1.0, load_unit, thermal, packed)
         volts = np.empty(n)
-        voltage_into(volts, state, q, packed)
+        voltage_batch(state, q, False, packed, volts)
         for m in range(0, n, 7):
             one = initial_state(q[m])
             for k in range(steps[m]):
@@ -102,12 +103,12 @@ def test_a_cell_comes_out_the_same_in_a_batch_of_any_size_and_on_its_own_way(loa
             rtol = 0.0 if constants[m] is NEW_CELL else 1e-14  # a constant times a factor is rounded twice
             np.testing.assert_allclose(state[m], one, rtol=rtol)
             np.testing.assert_allclose(volts[m], voltage(one, q[m]), rtol=rtol)
-        out = np.empty_like(state)
-        step_into(out, state, loads[first], q, r, 1.0, load_unit, thermal, packed)
+        out, is_power = np.empty_like(state), load_unit == "power"
+        step_batch(state, loads[first], q, r, 1.0, is_power, thermal, False, packed, out)
         for size in (1, 3, 64, 65):
             part = np.empty((size, 8))
             some = NEW_CELL.packed_with(factors[:size]) if own else packed
-            step_into(part, state[:size], loads[first][:size], q[:size], r[:size], 1.0, load_unit, thermal, some)
+            step_batch(state[:size], loads[first][:size], q[:size], r[:size], 1.0, is_power, thermal, False, some, part)
             np.testing.assert_array_equal(part, out[:size])
 
 
@@ -130,7 +131,7 @@ def test_simulation_stops_where_it_is_told():
     assert len(simulate(2.0, 7600.0, 0.1, until=100.0).time_s) == 101
     assert np.isnan(simulate(2.0, 7600.0, 0.1, until=100.0).eod_time_s)
     assert len(simulate(np.full(40, 2.0), 7600.0, 0.1).time_s) == 40
-    assert simulate(0.0, 7600.0, 0.1, max_duration_s=1000.0).time_s[-1] == 1000.0
+    assert simulate(0.0, 7600.0, 0.1).time_s[-1] == 86_400.0
 
 
 def test_extended_model_is_the_model_where_it_is_defined_and_finite_where_not():
@@ -138,11 +139,11 @@ def test_extended_model_is_the_model_where_it_is_defined_and_finite_where_not():
     state, n = discharge.state, len(discharge.state)
     load, q, r = np.full(n, 12.0), np.full(n, 6000.0), np.full(n, 0.12)
     plain, extended = np.empty_like(state), np.empty_like(state)
-    step_into(plain, state, load, q, r, 1.0, "power", False, NEW_CELL.packed)
-    step_into(extended, state, load, q, r, 1.0, "power", False, NEW_CELL.packed, extended=True)
+    for is_extended, out in ((False, plain), (True, extended)):
+        step_batch(state, load, q, r, 1.0, True, False, is_extended, NEW_CELL.packed, out)
     np.testing.assert_array_equal(plain, extended)
     for wrong in (4000.0, 8000.0):
-        step_into(extended, state, load, np.full(n, wrong), r, 1.0, "power", False, NEW_CELL.packed, extended=True)
+        step_batch(state, load, np.full(n, wrong), r, 1.0, True, False, True, NEW_CELL.packed, extended)
         assert np.isfinite(extended).all()
 
 

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.integrate import trapezoid
 
-from battery_env import NEW_CELL, load_nasa_discharges
-from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, RandomWalk, constant, recorded
+from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, RandomWalk, constant
 from battery_env.records import Samples
 
 
@@ -69,18 +67,6 @@ def test_a_random_walk_visits_all_values_alike_and_remembers():
     assert np.corrcoef(walks[:, 0], walks[:, 1])[0, 1] > 0.7
 
 
-def test_a_recorded_load_keeps_charge_and_energy():
-    part = load_nasa_discharges("B0006")[100].loaded_part(NEW_CELL.VEOD)
-    time_s = part.time_s - part.time_s[0]
-    for unit, value in (("current", part.current_A), ("power", part.current_A * part.voltage_V)):
-        for steps in (100, 3000):
-            dt_s = time_s[-1] / steps
-            load = recorded(part, unit, dt_s)
-            assert load.unit == unit and len(load.value) == steps and load(1e6) == load.value[-1]
-            assert dt_s * load.value.sum() == pytest.approx(trapezoid(value, time_s), rel=1e-12)
-    assert recorded(part, "power", 1.0).start_s[-1] == int(time_s[-1]) - 1.0
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -96,8 +82,6 @@ def test_a_recorded_load_keeps_charge_and_energy():
         (lambda: RandomWalk(value_range=(2.0, 2.0)), "width of value_range"),
         (lambda: RandomWalk(value_range=(2.0, 8000.0)), "got 8000.*unit of the load is power"),
         (lambda: RandomWalk(largest_step=-1.0), "largest_step must be a positive, finite number, got -1.0"),
-        (lambda: recorded(load_nasa_discharges("B0005")[0], "energy"), "unit must be 'power'.* got 'energy'"),
-        (lambda: recorded(load_nasa_discharges("B0005")[0], dt_s=1e5), "dt_s must be at most the record's 3690.* got 100000"),
     ],
 )
 def test_nonsense_is_refused(make, message):

@@ -59,9 +59,7 @@ def cell_that_is_off(trajectory, unknown, size):
     else:
         cell = cell.replace(**{unknown: getattr(cell, unknown) * np.exp(size)})
     current_A = trajectory.current_A
-    whole = simulate(
-        current_A, q_mobile, r_o, load_unit="current", cell=cell, cut_off_V=-np.inf, max_duration_s=len(current_A) - 1
-    )
+    whole = simulate(current_A, q_mobile, r_o, load_unit="current", cell=cell, cut_off_V=-np.inf, until=len(current_A) - 1)
     return Samples(trajectory.time_s, whole.voltage_V[: len(current_A)] + offset_V, current_A)
 
 

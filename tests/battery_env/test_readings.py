@@ -42,7 +42,7 @@ def test_misfit_is_that_of_a_whole_simulation(aged_both, readings):
     rms_V, last_V = compare(readings, q_mobile, r_o)[3:]
     for n, trajectory in enumerate(aged_both):
         model = simulate(
-            trajectory.current_A, 7600.0, 0.15, load_unit="current", cut_off_V=-np.inf, max_duration_s=len(trajectory.time_s)
+            trajectory.current_A, 7600.0, 0.15, load_unit="current", cut_off_V=-np.inf, until=len(trajectory.time_s)
         )
         modelled_V = model.voltage_V[10 : 10 * readings.count[n] + 1 : 10]
         exact_V = np.sqrt(np.mean((readings.voltage_V[readings.part(n)] - modelled_V) ** 2))

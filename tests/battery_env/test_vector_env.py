@@ -20,7 +20,7 @@ NOISY = {"initial_perturbation": 3.0, "continue_probability": 0.5, "first_sample
 
 @pytest.fixture(scope="module")
 def discharges():
-    return TrajectoryDataset.generate(("q_mobile", "r_o"), 6, RandomPiecewise(), seed=0, mismatch=0.1)
+    return TrajectoryDataset.generate(("q_mobile", "r_o"), 6, RandomPiecewise(), seed=0)
 
 
 def make_pair(env_id, mode, cells=3, **options):
@@ -70,26 +70,11 @@ def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, op
             step[3][:] = False  # what was returned is the caller's
 
 
-def test_without_autoreset_the_caller_says_which_cells_start(discharges):
-    batch = gym.make_vec("BatteryQmax-v0", num_envs=3, autoreset_mode="Disabled", dataset=discharges, episode_steps=3)
-    task = batch.unwrapped.task
-    batch.reset(seed=0)
-    mask = np.array([False, True, False])
-    batch.step(np.zeros((3, 1)))
-    *_, info = batch.reset(seed=[None, 8, None], options={"reset_mask": mask, "trajectory": 4})
-    np.testing.assert_array_equal(info["_cost"], mask)
-    assert task.now["decisions"].tolist() == [1, 0, 1] and task.now["trajectory"][1] == 4
-    batch.step(np.zeros((3, 1)))
-    assert batch.step(np.zeros((3, 1)))[3].tolist() == [True, False, True]
-    with pytest.raises(gym.error.ResetNeeded, match=r"episodes of cells \[0, 2\] are over"):
-        batch.step(np.zeros((3, 1)))
-    batch.reset(options={"reset_mask": ~mask})
-    assert batch.step(np.zeros((3, 1)))[3].tolist() == [False, True, False]
-
-
 def test_nonsense_is_refused(discharges):
     with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
         gym.make_vec("BatteryQmax-v0", num_envs=0, dataset=discharges)
+    with pytest.raises(ValueError, match="'NextStep' or 'SameStep', got 'Disabled'"):
+        gym.make_vec("BatteryQmax-v0", autoreset_mode="Disabled", dataset=discharges)
     for make in (gym.make, gym.make_vec):
         # Libraries that try options read it in the words of Python
         with pytest.raises(TypeError, match=r"unexpected keyword argument 'frameskip'\. There are .*episode_steps"):
@@ -99,9 +84,6 @@ def test_nonsense_is_refused(discharges):
         batch.step(np.zeros((2, 1)))
     with pytest.raises(ValueError, match="one for each of the 2 cells, got 3"):
         batch.reset(seed=[1, 2, 3])
-    for mask in ([True, False], np.ones(3, dtype=bool), np.zeros(2, dtype=bool), np.ones(2)):
-        with pytest.raises(ValueError, match="reset_mask"):
-            batch.reset(options={"reset_mask": mask})
     with pytest.raises(ValueError, match=r"'trajectory' and 'sample', got \['where'\]"):
         batch.reset(options={"where": 3})
 

@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from battery_env.arrays import IntArray
 from battery_env.checks import check_not_negative
@@ -22,7 +22,6 @@ from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
 from battery_env.tasks.full_state.decisions import decide, look_ahead, observe
 from battery_env.tasks.full_state.layout import (
     CELL,
-    CELL_WITH_CONSTANTS,
     ERROR_SCALE,
     JUDGED_BY,
     LITERAL,
@@ -42,10 +41,10 @@ _PERTURBATION = np.array([1.0, 1.0, 1.0, -0.9, -0.1, 0.9, 0.1])
 
 @lru_cache(maxsize=4)
 def _reachable(
-    formulation: Formulation, parameters: Sequence[str], load: LoadKind, split: Split, dt_s: float, mismatch: float
+    formulation: Formulation, parameters: Sequence[str], load: LoadKind, split: Split, dt_s: float
 ) -> TrajectoryDataset:
     # the discharges of the standard data set whose parameters actions can stand for
-    dataset = standard_dataset(parameters, load, split, dt_s, mismatch)
+    dataset = standard_dataset(parameters, load, split, dt_s)
     values = {"q_mobile": dataset.q_mobile, "r_o": dataset.r_o}
     ranges = formulation.action_ranges.items()
     within = np.all([(low <= values[name]) & (values[name] <= high) for name, (low, high) in ranges], axis=0)
@@ -60,7 +59,7 @@ class FullStateTask(CalibrationTask):
     registered tasks differ in attributes of their classes. The page of ``BatteryQmax-v0`` describes the options.
 
     The cell is simulated beside the model, from the parameters and loads of the data set. The model is extended where a wrong
-    parameter leaves its domain (:func:`battery_env.electrochemistry.step_into`, ``extended``).
+    parameter leaves its domain (:func:`battery_env.electrochemistry.kernels.step_batch`, ``extended``).
 
     :ivar formulation: how states become observations and costs
     :ivar now: the cells at their samples, records of :data:`~battery_env.tasks.full_state.layout.CELL`
@@ -84,7 +83,6 @@ class FullStateTask(CalibrationTask):
         load: LoadKind = "paper",
         split: Split = "train",
         dt_s: float = 1.0,
-        mismatch: float = 0.0,
         dataset: TrajectoryDataset | str | os.PathLike[str] | None = None,
     ) -> None:
         check_not_negative(
@@ -99,7 +97,7 @@ class FullStateTask(CalibrationTask):
         self.cells = cells
         self.episode_steps = self.episode_steps if episode_steps is None else episode_steps
         check_counts(episode_steps=self.episode_steps)
-        data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
+        data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s}
         if dataset is None:
             self.dataset = _reachable(self.formulation, self.parameters, **data)
         else:
@@ -111,9 +109,8 @@ class FullStateTask(CalibrationTask):
         self.observation_size = (4 if self.formulation.innovations else 2) * OBSERVED_SIZE + 1
         self._settings = self._kernel_settings()
         self._starts = list(zip(self.dataset.first.tolist(), (self.dataset.stop - 2).tolist(), strict=True))
-        self._has_own_constants = bool((self.dataset.factors != 1.0).any())
-        if self.dataset.equilibrium_V.any():
-            raise ValueError("dataset has cells with an equilibrium voltage of their own: take a voltage-only task for them")
+        if (self.dataset.factors != 1.0).any() or self.dataset.equilibrium_V.any():
+            raise ValueError("dataset has cells with constants of their own: take a voltage-only task for them")
         nowhere = np.zeros(cells, dtype=np.int64)
         first = nowhere + self.dataset.first[0]
         self.now = self._begin(nowhere, first, nowhere + self.episode_steps, np.zeros((cells, 4)))
@@ -180,7 +177,7 @@ class FullStateTask(CalibrationTask):
     def _begin(self, trajectory: IntArray, sample: IntArray, steps: IntArray, perturbation: FloatArray) -> Records:
         """Cells at samples of discharges."""
         dataset = self.dataset
-        cells = np.zeros(len(sample), dtype=CELL_WITH_CONSTANTS if self._has_own_constants else CELL)
+        cells = np.zeros(len(sample), dtype=CELL)
         cells["trajectory"], cells["sample"], cells["steps"] = trajectory, sample, steps
         cells["last_sample"] = dataset.samples[trajectory] - 1
         cells["last_decision"] = dataset.stop[trajectory] - 2
@@ -193,15 +190,12 @@ class FullStateTask(CalibrationTask):
         cells["model_state"] = cells["state"]
         if self.initial_perturbation > 0.0:
             cells["model_state"][:, OBSERVED] += perturbation[:, [0, 1, 2, 3, 3, 3, 3]] * _PERTURBATION * ERROR_SCALE
-        if self._has_own_constants:
-            cells["constants"] = dataset.packed(trajectory).constants
         self._look_ahead(cells)
         return cells
 
     def _look_ahead(self, cells: Records) -> None:
         """The load of the step from t to t + 1, and where it takes the cells."""
-        constants = cells["constants"] if self._has_own_constants else self.dataset.cell.packed.constants
-        look_ahead(self._settings, self.dataset.load_values, constants, cells)
+        look_ahead(self._settings, self.dataset.load_values, self.dataset.cell.packed.constants, cells)
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """Take the actions, step the model, and move on to the next sample."""
@@ -241,7 +235,8 @@ class FullStateTask(CalibrationTask):
         """Go on without the cells whose episodes are over."""
         over = self.truncated()
         if over.any():
-            self.keep(~over)
+            self.now = self.now[~over]
+            self.cells = len(self.now)
 
     def truncated(self) -> NDArray[np.bool_]:
         """Whose episode is over, as its steps or its data have come to an end."""
@@ -256,20 +251,6 @@ class FullStateTask(CalibrationTask):
         out = np.empty((self.cells, self.observation_size), dtype=np.float32)
         observe(self._settings, self.now, OBSERVATION_LIMIT, out)
         return out
-
-    def action_of(self, values: Mapping[str, ArrayLike]) -> FloatArray:
-        """
-        The actions that stand for parameters by name, C and ohm, beyond [-1, 1] out of their range: shape (...,
-        len(parameters)).
-        """
-        wanted = np.stack([np.asarray(values[name], dtype=np.float64) for name in self.parameters], axis=-1)
-        lowest, highest = np.array([self.formulation.action_ranges[name] for name in self.parameters]).T
-        return 2.0 * (wanted - lowest) / (highest - lowest) - 1.0
-
-    def keep(self, rows: NDArray[np.bool_]) -> None:
-        """Go on with some of the cells only, those where ``rows`` of shape (cells,) is true."""
-        self.now = self.now[rows]
-        self.cells = len(self.now)
 
     def report(self) -> dict[str, FloatArray]:
         """Where each cell stands after its last decision."""

@@ -123,5 +123,3 @@ CELL = np.dtype(
         ("r_o_hat", float),  # of the model, ohm
     ]
 )
-#: Likewise, of a cell whose constants are not the model's.
-CELL_WITH_CONSTANTS = np.dtype([*CELL.descr, ("constants", float, (CONSTANTS_SIZE,))])

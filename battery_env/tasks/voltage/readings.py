@@ -238,7 +238,7 @@ def _linear_part(
         load_unit="current",
         cell=cell,
         cut_off_V=-np.inf,
-        max_duration_s=len(current_A) * dt_s,
+        until=len(current_A) * dt_s,
     ).state
     if len(state) <= steps[-1]:
         drawn_C = dt_s * float(current_A.sum())
