@@ -155,12 +155,17 @@ def test_loads_of_other_kinds_and_time_steps():
         ("load", "sine", "load must be one of"),
         ("split", "validation", "split must be"),
         ("dt_s", 20.0, "dt must be"),
-        ("dataset", TrajectoryDataset.generate("r_o", 2, [constant(12.0)], 0, mismatch=0.2), "constants of their own"),
     ],
 )
 def test_options_out_of_range_are_refused(option, value, message):
     with pytest.raises(ValueError, match=message):
         BatteryQmax(1, **{option: value})
+
+
+def test_cells_whose_constants_are_not_the_models_are_refused():
+    data = TrajectoryDataset.generate("r_o", 2, [constant(12.0)], seed=0, mismatch=0.2)
+    with pytest.raises(ValueError, match="constants of their own"):
+        make(data, BatteryRo)
 
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
