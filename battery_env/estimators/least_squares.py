@@ -316,14 +316,8 @@ class LeastSquares(Estimator):
     def _verdict(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> Verdict:
         """What speaks against an estimate."""
         fit, alone, evidence, (soc, sd_soc) = fitted.fit, fitted.alone, fitted.evidence, self.initial_soc
-        ratio = {"q_mobile": self._sd_ratio}
         diagnosis = Diagnosis(evidence, measured(evidence, soc, float(record.time_s[0]), history.charge))
-        n, free, own, is_stated = (
-            len(fit.residual_V),
-            self.parameters,
-            fitted.sd(alone, ratio),
-            self.voltage_noise_V is not None,
-        )
+        n, free, is_stated = len(fit.residual_V), self.parameters, self.voltage_noise_V is not None
         diagnosis.note(Reason.EMPTY, n < len(record.time_s))
         diagnosis.note(Reason.FEW, not is_stated and n < len(free) + SPARE_SAMPLES)
         noise_V = self.voltage_noise_V or white_noise_V(fit.residual_V)
@@ -342,7 +336,8 @@ class LeastSquares(Estimator):
             diagnosis.note_about(name, Reason.AT_BOUND)
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
         known = Assumptions(self.current_gain_sd, sd_soc / soc, is_along_path=self.path is not None)
-        return diagnosis.verdict(alone.values, own, free, priors, known)
+        own_sds = fitted.sd(alone, {"q_mobile": self._sd_ratio})
+        return diagnosis.verdict(alone.values, own_sds, free, priors, known)
 
 
 def _note_end(diagnosis: Diagnosis, record: Samples, fitted: _Fitted, deviation_V: float) -> None:

@@ -139,11 +139,11 @@ class Verdict(NamedTuple):
         """What follows from a row of ``JUDGED``; texts are filled with what was measured."""
         texts = []
         for k in range(len(PARAMETER_NAMES)):
-            reason, of_doubt = Reason(judged["reason"][k]), {}
+            reason, known = Reason(judged["reason"][k]), dict(measured)
             if reason is Reason.IN_DOUBT:
-                doubt = Doubt(judged["doubt"][k])
-                of_doubt = {"in_doubt": judged["in_doubt"][k], "doubt": doubt.text.format_map(measured)}
-            texts.append(reason.said(PARAMETER_NAMES[judged["about"][k]], {**measured, **of_doubt}))
+                known["in_doubt"] = judged["in_doubt"][k]
+                known["doubt"] = Doubt(judged["doubt"][k]).text.format_map(measured)
+            texts.append(reason.said(PARAMETER_NAMES[judged["about"][k]], known))
         in_order = dict.fromkeys(reversed(texts) if judged["r_o_comes_first"] else texts)
         return cls(not texts[0], not texts[1], " ".join(filter(None, in_order)))
 
