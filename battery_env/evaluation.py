@@ -21,8 +21,6 @@ from battery_env.records.model import RecordModel
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
-#: An estimate has settled when it stays within this share of the truth from then on.
-SETTLING_BANDS_PERCENT = (5.0, 1.0)
 #: The end of discharge is also forecast with the estimates held at these times, as shares of its true time.
 FORECAST_PERCENT = (25, 50, 75)
 
@@ -51,13 +49,13 @@ def evaluate(
     ==================================== =============================================================================
     ``p``                                the true value
     ``p_hat``, ``p_final``               mean of its estimates, the last one
-    ``p_mae``, ``p_rmse``, ``p_worst``   mean, root mean square and largest absolute error
+    ``p_worst``                          largest absolute error
     ``p_mape_percent``                   mean absolute error, % of the true value
     ``p_second_half_mape_percent``       likewise, of the estimates in the second half of the discharge
     ``p_final_error_percent``            likewise, of the last one
     ``p_bias``, ``p_spread``             mean error, standard deviation of the estimates
-    ``p_settling_time_5_percent_s``,     time since the first sample from which on all estimates are that close; infinite
-    ``p_settling_time_1_percent_s``      if the last one is not
+    ``p_settling_time_1_percent_s``      time since the first sample from which on all estimates are that close; infinite
+                                         if the last one is not
     ``p_coverage_percent``               share of the estimates within two stated standard deviations of the truth
     ``p_bound``                          the Cramér-Rao bound: standard deviation that no unbiased calibrator can be below
                                          with these sensors
@@ -130,12 +128,10 @@ def _errors(name: str, record: Trajectory, trace: EstimateTrace) -> dict[str, fl
     magnitude = np.abs(error)
     percent = 100.0 * magnitude / true
     second_half = percent[trace.time_s >= 0.5 * record.eod_time_s]
-    scores = {
+    return {
         name: true,
         f"{name}_hat": estimates.mean(),
         f"{name}_final": estimates[-1],
-        f"{name}_mae": magnitude.mean(),
-        f"{name}_rmse": np.sqrt(np.mean(error**2)),
         f"{name}_worst": magnitude.max(),
         f"{name}_mape_percent": percent.mean(),
         f"{name}_second_half_mape_percent": second_half.mean() if len(second_half) else np.nan,
@@ -143,11 +139,8 @@ def _errors(name: str, record: Trajectory, trace: EstimateTrace) -> dict[str, fl
         f"{name}_bias": error.mean(),
         f"{name}_spread": estimates.std(),
         f"{name}_coverage_percent": 100.0 * np.mean(magnitude <= 2.0 * sd) if _states_sd(trace, name) else np.nan,
+        f"{name}_settling_time_1_percent_s": _since(percent <= 1.0, trace.time_s) - record.time_s[0],
     }
-    for band in SETTLING_BANDS_PERCENT:
-        settled_s = _since(percent <= band, trace.time_s)
-        scores[f"{name}_settling_time_{band:g}_percent_s"] = settled_s - record.time_s[0]
-    return scores
 
 
 def _since(holds: BoolArray, time_s: FloatArray) -> float:
@@ -201,9 +194,7 @@ def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:
     true, mape = scores[parameter], scores[f"{parameter}_mape_percent"]
     summary = {
         "mape_percent": mape.mean(),
-        "mape_median_percent": mape.median(),
         "mape_worst_percent": mape.max(),
-        "rmse_percent": (100.0 * scores[f"{parameter}_rmse"] / true).mean(),
         "second_half_mape_percent": scores[f"{parameter}_second_half_mape_percent"].mean(),
         "final_error_percent": scores[f"{parameter}_final_error_percent"].mean(),
         "final_error_worst_percent": scores[f"{parameter}_final_error_percent"].max(),
@@ -211,9 +202,8 @@ def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:
         "spread_percent": (100.0 * scores[f"{parameter}_spread"] / true).mean(),
         "coverage_percent": scores[f"{parameter}_coverage_percent"].mean(),
         "bound_percent": (100.0 * scores[f"{parameter}_bound"] / true).mean(),
+        "settling_time_1_percent_s": scores[f"{parameter}_settling_time_1_percent_s"].median(),
     }
-    for band in SETTLING_BANDS_PERCENT:
-        summary[f"settling_time_{band:g}_percent_s"] = scores[f"{parameter}_settling_time_{band:g}_percent_s"].median()
     for when in ("", *(f"_at_{percent}_percent" for percent in FORECAST_PERCENT)):
         summary[f"eod_error_percent{when}"] = (100.0 * scores[f"eod_error{when}_s"].abs() / scores["eod_time_s"]).mean()
     return {name: float(value) for name, value in summary.items()}

@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -17,8 +17,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from battery_env.arrays import FloatArray
-from battery_env.electrochemistry.ends import BAND
 from battery_env.estimators.cell_fit import CellFit
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.evaluation import over_seeds
@@ -178,16 +176,13 @@ def plot_learning_curves(
     return figure
 
 
-def plot_discharge(
-    record: Record, forecasts: Mapping[str, VoltageForecast], title: str = "", end: Expected | None = None
-) -> Figure:
+def plot_discharge(record: Record, forecasts: Mapping[str, VoltageForecast], title: str = "") -> Figure:
     """
     The measured voltage of one discharge with that of the model at some estimates, the current, and the error of the model.
 
     :param record: one discharge, simulated or recorded
     :param forecasts: what :meth:`battery_env.RecordModel.forecast` made of estimates, by name for the legend
     :param title: of the figure
-    :param end: of a discharge in progress what :func:`battery_env.forecast` expects of it
     :return: the figure; a line ends at the cut-off, and that of its error where the model cell is empty
     """
     figure = new_figure(6.4, 5.4)
@@ -199,8 +194,6 @@ def plot_discharge(
         upper.plot(forecast.time_s, forecast.voltage_V, color=colour, lw=1.4, label=name)
         error_mV = 1e3 * (forecast.at_samples_V - record.voltage_V)
         lower.plot(record.time_s, error_mV, color=colour, lw=1.0, label=name)
-    if end is not None:
-        draw_end(upper, end)
     figure.suptitle(title, fontsize=10)
     upper.set_ylabel("voltage (V)")
     upper.legend(frameon=False, fontsize=9, loc="lower left")
@@ -208,33 +201,6 @@ def plot_discharge(
     middle.set(ylabel="current (A)", ylim=(min(-0.1 * most_A, 1.1 * float(record.current_A.min())), 1.2 * most_A))
     lower.set(xlabel="time (s)", ylabel="model -\nmeasured (mV)")
     return _finished(figure, *panels)
-
-
-class Expected(Protocol):
-    """What may come of a discharge: a :class:`battery_env.Forecast`."""
-
-    @property
-    def time_s(self) -> FloatArray: ...
-
-    @property
-    def voltage_V(self) -> FloatArray: ...
-
-    def eod_quantile_s(self) -> FloatArray: ...
-
-
-def draw_end(axes: Axes, expected: Expected) -> None:
-    """Draw what may come of a discharge into axes of voltage over time: the voltage to expect, and the interval of its end."""
-    inside = f"{100.0 * (BAND[2] - BAND[0]):.0f} %"
-    time_s, (low_V, median_V, high_V), end_s = expected.time_s, expected.voltage_V, expected.eod_quantile_s()
-    if np.isfinite(end_s).all():
-        # an end that may be far away would leave no room for what was seen
-        last_s = min(end_s[2], 1.5 * max(time_s[0], end_s[1]))
-        axes.axvspan(min(end_s[0], last_s), last_s, color=COLOURS[1], alpha=0.2, lw=0, label=f"end of discharge, {inside}")
-        axes.axvline(end_s[1], color=COLOURS[1], lw=1.2)
-        seen = time_s <= last_s
-        time_s, low_V, median_V, high_V = (each[seen] for each in (time_s, low_V, median_V, high_V))
-    axes.fill_between(time_s, low_V, high_V, color=COLOURS[0], alpha=0.25, lw=0, label=f"voltage, {inside}")
-    axes.plot(time_s, median_V, color=COLOURS[0], lw=1.4, label="voltage, median")
 
 
 def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:

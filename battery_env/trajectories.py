@@ -160,7 +160,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
         loads: Sequence[Load] | LoadSampler,
         seed: int,
         dt_s: float = 1.0,
-        thermal: bool = False,
     ) -> TrajectoryDataset:
         """
         Discharges of ``n`` cells drawn along a path, whose constants age together with ``q_mobile`` and ``r_o``; loads, seed
@@ -179,7 +178,14 @@ class TrajectoryDataset(Sequence[Trajectory]):
         cells = path.draw(n, seed)
         drawn, index = _drawn_loads(loads, n, np.random.default_rng([seed, 1]))
         return TrajectoryDataset.simulated(
-            cells.q_mobile, cells.r_o, drawn, index, dt_s, thermal, path.cell, cells.factors, cells.equilibrium_V
+            cells.q_mobile,
+            cells.r_o,
+            drawn,
+            index,
+            dt_s,
+            cell=path.cell,
+            factors=cells.factors,
+            equilibrium_V=cells.equilibrium_V,
         )
 
     @staticmethod

@@ -73,14 +73,7 @@ def test_the_table_of_arguments_is_that_of_the_options(env_id):
 
 def test_common_options_are_options_of_all(dataset):
     names = first_cells("battery_env", "Options that all of them take")
-    options = {
-        "split": "test",
-        "render_mode": "rgb_array",
-        "load": "constant",
-        "mismatch": 0.1,
-        "dt_s": 1.0,
-        "episode_steps": 4,
-    }
+    options = {"split": "test", "render_mode": "rgb_array", "episode_steps": 4}
     assert set(names) == {*options, "dataset"}
     for env_id in TASKS:
         for name, value in options.items():

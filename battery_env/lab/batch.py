@@ -526,5 +526,5 @@ def _voltages_of(name: str, found: Calibration) -> dict[str, bytes]:
     table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False).encode()
     picture = io.BytesIO()
     models = {f"model, {METHOD_NAMES[found.method]}": forecast}
-    plot_discharge(record, models, title_of(literal(name), found), found.end).savefig(picture, dpi="figure")
+    plot_discharge(record, models, title_of(literal(name), found)).savefig(picture, dpi="figure")
     return {"csv": table, "png": picture.getvalue()}

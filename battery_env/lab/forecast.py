@@ -111,12 +111,21 @@ class Forecast:
 
     def plot(self) -> Figure:
         """The voltage of the record and the one to expect, with the interval of the end of discharge."""
-        from battery_env.plotting import draw_end, new_figure  # here, as matplotlib takes long to import
+        from battery_env.plotting import COLOURS, new_figure  # here, as matplotlib takes long to import
 
         figure = new_figure(6.4, 3.6)
         axes = figure.subplots()
         axes.plot(self.record.time_s, self.record.voltage_V, ".", ms=2.5, color="0.6", label="measured")
-        draw_end(axes, self)
+        inside = f"{100.0 * (BAND[2] - BAND[0]):.0f} %"
+        time_s, voltage_V, end_s = self.time_s, self.voltage_V, self.eod_quantile_s()
+        if np.isfinite(end_s).all():
+            # an end that may be far away would leave no room for what was seen
+            last_s = min(end_s[2], 1.5 * max(self.now_s, end_s[1]))
+            axes.axvspan(min(end_s[0], last_s), last_s, color=COLOURS[1], alpha=0.2, lw=0, label=f"end of discharge, {inside}")
+            axes.axvline(end_s[1], color=COLOURS[1], lw=1.2)
+            time_s, voltage_V = time_s[time_s <= last_s], voltage_V[:, time_s <= last_s]
+        axes.fill_between(time_s, voltage_V[0], voltage_V[2], color=COLOURS[0], alpha=0.25, lw=0, label=f"voltage, {inside}")
+        axes.plot(time_s, voltage_V[1], color=COLOURS[0], lw=1.4, label="voltage, median")
         axes.axhline(self.cut_off_V, color="0.6", lw=0.8)
         axes.set(xlabel="time (s)", ylabel="voltage (V)")
         axes.grid(alpha=0.25)

@@ -117,7 +117,7 @@ class Life:
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
         return life_of(self.table.iloc[:count])
 
-    def remaining_discharges(self, threshold_Ah: float, probability: ArrayLike = BAND, seed: int = 0) -> FloatArray:
+    def remaining_discharges(self, threshold_Ah: float, probability: ArrayLike = BAND) -> FloatArray:
         """
         The remaining useful life: how many discharges are still to come, the one included that first has less capacity than
         the threshold. The cell is used as before; its capacity is in proportion to ``q_mobile``, as in the last discharge, and
@@ -125,8 +125,7 @@ class Life:
 
         :param threshold_Ah: capacity at which the life ends, Ah
         :param probability: of the quantiles, within 0 .. 1, any shape
-        :param seed: of the 2000 lives that are simulated
-        :return: quantiles, same shape as ``probability``; infinite beyond 2000 discharges
+        :return: quantiles over 2000 lives that are simulated, same shape as ``probability``; infinite beyond 2000 discharges
         :raises ValueError: for an argument out of range
         """
         check_positive("threshold_Ah", threshold_Ah)
@@ -134,7 +133,7 @@ class Life:
         end = log(threshold_Ah * last["q_mobile_C"] / last["capacity_Ah"])
         from scipy.stats import truncnorm  # slow to import, and nothing else here needs it
 
-        rng = np.random.default_rng(check_whole_number("seed", seed))
+        rng = np.random.default_rng(0)
         (level_mean, drift_mean), ((p_level, p_both), (_, p_drift)) = self.state, self.covariance
         drift_sd = sqrt(p_drift)
         lives = 2000

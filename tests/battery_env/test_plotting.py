@@ -126,11 +126,10 @@ def test_a_name_has_one_colour_in_all_figures():
 
 def test_a_discharge_in_progress_ends_in_a_band(record):
     seen = Samples.of(record).first(1000)
-    model = {"model": RecordModel().forecast(seen, Estimate(6000.0, 0.15))}
     expected = forecast(seen, Estimate(6000.0, 0.15), samples=3)
     ends = replace(expected, eod_time_s=np.array([999.0, 2500.0, 9000.0]))
-    voltage, *_ = plot_discharge(seen, model, end=ends).axes
-    band, end = voltage.patches[0], voltage.lines[-2]
+    (voltage,) = ends.plot().axes
+    band, end = voltage.patches[0], voltage.lines[1]
     # from the end of the record, which has not reached it, to what can be shown
     assert (band.get_x(), band.get_x() + band.get_width()) == (999.0, 3750.0) and set(end.get_xdata()) == {2500.0}
-    assert not plot_discharge(seen, model, end=replace(expected, eod_time_s=np.full(3, np.inf))).axes[0].patches
+    assert not replace(expected, eod_time_s=np.full(3, np.inf)).plot().axes[0].patches

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from battery_env.electrochemistry import NEW_CELL, FloatArray, Trajectory
 from battery_env.electrochemistry.kernels import voltage_batch
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
-from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
+from battery_env.tasks.data import Split, opened, standard_dataset
 from battery_env.tasks.full_state.decisions import decide, look_ahead, observe
 from battery_env.tasks.full_state.layout import (
     CELL,
@@ -37,18 +36,6 @@ from battery_env.trajectories import TrajectoryDataset
 # A model that was wrong for a while has moved too much or too little charge from one electrode to the other. In both
 # electrodes nine tenths of that charge are in the bulk.
 _PERTURBATION = np.array([1.0, 1.0, 1.0, -0.9, -0.1, 0.9, 0.1])
-
-
-@lru_cache(maxsize=4)
-def _reachable(
-    formulation: Formulation, parameters: Sequence[str], load: LoadKind, split: Split, dt_s: float
-) -> TrajectoryDataset:
-    # the discharges of the standard data set whose parameters actions can stand for
-    dataset = standard_dataset(parameters, load, split, dt_s)
-    values = {"q_mobile": dataset.q_mobile, "r_o": dataset.r_o}
-    ranges = formulation.action_ranges.items()
-    within = np.all([(low <= values[name]) & (values[name] <= high) for name, (low, high) in ranges], axis=0)
-    return dataset if within.all() else dataset.subset(np.flatnonzero(within))
 
 
 class FullStateTask(CalibrationTask):
@@ -80,9 +67,7 @@ class FullStateTask(CalibrationTask):
         continue_probability: float = 0.0,
         first_sample_probability: float = 0.0,
         initial_perturbation: float = 0.0,
-        load: LoadKind = "paper",
         split: Split = "train",
-        dt_s: float = 1.0,
         dataset: TrajectoryDataset | str | os.PathLike[str] | None = None,
     ) -> None:
         check_not_negative(
@@ -97,11 +82,10 @@ class FullStateTask(CalibrationTask):
         self.cells = cells
         self.episode_steps = self.episode_steps if episode_steps is None else episode_steps
         check_counts(episode_steps=self.episode_steps)
-        data: dict[str, Any] = {"load": load, "split": split, "dt_s": dt_s}
         if dataset is None:
-            self.dataset = _reachable(self.formulation, self.parameters, **data)
+            self.dataset = standard_dataset(self.parameters, "paper", split)
         else:
-            self._refuse_beside_a_dataset(**data)
+            self._refuse_beside_a_dataset(split=split)
             self.dataset = opened(dataset)
         self.decision_s = self.dataset.dt_s
         self.continue_probability, self.first_sample_probability = continue_probability, first_sample_probability
