@@ -193,7 +193,7 @@ def _forecast_parser() -> argparse.ArgumentParser:
 
 
 _FILE_HELP = (
-    "text of any delimiter, .xlsx, .xls, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them, or "
+    "text of any delimiter, .xlsx, Parquet, NASA's .mat, Neware's .nda and .ndax, BioLogic's .mpr; a folder of them, or "
     "of folders; FILE:CYCLE for one discharge of a life; or a bundled cell, B0005, and its discharge, B0005:12"
 )
 

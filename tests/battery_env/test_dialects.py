@@ -21,13 +21,11 @@ NAMES = [
     "Test Time,Date Time,Step Time,Voltage,Current,Temperature,Step,State,Discharge_Capacity",
     "TestTime,DPT_Time,StepTime,Cell_Potential,I,Aux_Temperature_1,Step_Index,what is done,Capacity",
     "Zeit,Datum/Uhrzeit,Schrittzeit,U,Strom,T,Schritt,Betriebsart,Entladekapazität",
-    "Temps,Date,Temps étape,Tension,Courant,Température,Etape,Etat,Capacité",
-    "Tiempo,Fecha,Step Time,Voltaje,Corriente,Temperatura,Step,Estado,Capacidad",
     "总时间,绝对时间,步骤时间,电压,电流,温度,工步号,工步类型,放电容量",
 ]
 STYLES = ["{}({})", "{} [{}]", "{}/{}", "{} / {}", "{}_{}", "{} in {}", "{}, {}", "{} {{{}}}", "{}: {}", "{} <{}>", "below"]
 WORDS = ["Charge,Rest,Discharge", "Laden,Pause,Entladen", "C,R,D", "CC Chg,Rest,CC DChg", "恒流充电,搁置,恒流放电"]
-WORDS += ["Charge,Repos,Décharge", "CHA,PAU,DCH", "1C charge,wait,1C discharge"]
+WORDS += ["CHA,PAU,DCH", "1C charge,wait,1C discharge"]
 DATES = ["%Y-%m-%d %H:%M:%S", "%d.%m.%Y %H:%M:%S", "%m/%d/%Y %I:%M:%S %p", "%Y-%m-%dT%H:%M:%SZ"]
 #: The first of each is the plainest, to which a failure is brought back.
 FEATURES = {

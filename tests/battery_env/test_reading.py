@@ -87,7 +87,7 @@ READ = {
     "no sensor": (named(**{"Temperature (C)": 0.0}), NOT_NEEDED),
     "a sensor that is not connected": (named(**{"Temperature (C)": -2501.7}), NOT_NEEDED),
     "dashes": (named(**{"Temperature (C)": "--"}), NOT_NEEDED),
-    "an unknown unit": (named(**{"Temperature (furlong)": 25.0}), "--units temperature=UNIT"),
+    "an unknown unit": (named(**{"Temperature (furlong)": 25.0}), ""),
     "no number of cycles": (named(Cycle=6.283), NOT_NEEDED),
     "three electrodes": (ELECTRODES, ""),
     "two electrodes": (ELECTRODES.drop(columns="Ewe-Ece/V"), "the voltage is Ewe/V less Ece/V"),
@@ -105,7 +105,6 @@ READ = {
     "a voltage that is missing": (at([40, 90], voltage=np.nan), "left out, as the voltage is missing: row 41 and 1 more"),
     "words in a row": (at(50, time="Step", voltage="three", current=""), "no measurement of a cell: row 51"),
     "no cell at the ends": (pd.concat([DEAD, TABLE], ignore_index=True), "no measurement of a cell: row 1 and 1 more"),
-    "the newest row first": (TABLE[::-1], "the clock runs backwards"),
     "a row twice": (pd.concat([TABLE[:100], TABLE[99:]], ignore_index=True), "row 101 has the time of the row before"),
     "a fault of the voltage": (at(100, voltage=0.003), ""),
     "rows of Float64 and an index": (TABLE.astype("Float64").set_index("time"), ""),
@@ -131,7 +130,7 @@ REFUSED = {
         named("time/s", "U/V", "I/A", **{"time/h": 1.0, "I/mA": 1.0}),
         r"both 'time/s' and 'time/h' may be the time: --columns time=NAME, or --ignore NAME .*both 'I/A' and 'I/mA'",
     ),
-    "an unknown unit": (named("time (furlong)", "U", "I"), "the unit 'furlong' of the column 'time .furlong.' is not known"),
+    "an unknown unit": (named("time (furlong)", "U", "I"), r"no column for the time\. header time \(furlong\), U, I"),
     "several cells": (named(**{"Cell ID": np.where(LOADED, "A", "B")}), r"'Cell ID' names 2 cells \(B, A\): give each a file"),
     "a step": (TABLE[:4], "needs 5 rows below the header, got 4"),
     "words for numbers": (named(voltage="OVERLOAD"), "'voltage' must hold numbers, got 'OVERLOAD' in row 1"),
@@ -147,6 +146,7 @@ REFUSED = {
         named(time=RECORD.time_s - 10.0 * (TABLE.index >= 150)),
         r"goes back: row 151 is at .* s, after",
     ),
+    "the newest row first": (TABLE[::-1], "goes back: row 2 and 320 more"),
     "a clock of each step": (
         named(time=RECORD.time_s - RECORD.time_s[150] * (TABLE.index >= 150)),
         "goes back: row 151 is at 0 s",
@@ -177,7 +177,10 @@ REFUSED = {
     "so little that it is noise": (named(current=1e-6 * (TABLE.index == 7)), "no current flows"),
     "no sign": (HALF_SIGN, r"the current has no sign: from row 1 on the voltage rises.*--columns state=NAME"),
     "no voltage that tells the sign": (named(voltage=3.7), "cannot be told.*State it: --discharge-is-negative"),
-    "jumps against what passes": (named(voltage=RECORD.voltage_V + 0.3 * RECORD.current_A), "cannot be told.*contradict"),
+    "jumps against what passes": (
+        named(voltage=RECORD.voltage_V + 0.3 * RECORD.current_A),
+        "in total: flip the sign of the current",
+    ),
     "ends of steps alone": (
         pd.concat(
             [
@@ -301,7 +304,7 @@ def test_what_follows_a_load_does_not_turn_the_sign(sign, after):
     assert found.charge_C > 0.99 * RECORD.charge_C and found.current_A.min() >= -0.01
 
 
-@pytest.mark.parametrize("order", [["CHARGE", "REST", "TABLE"], ["TABLE", "REST", "CHARGE"], ["LOW", "FLAT", "REST", "TABLE"]])
+@pytest.mark.parametrize("order", [["CHARGE", "REST", "TABLE"], ["TABLE", "LOW", "CHARGE"], ["LOW", "FLAT", "REST", "TABLE"]])
 def test_a_current_without_a_sign_is_refused_or_told_by_words(order):
     parts = {"CHARGE": CHARGE, "REST": REST, "TABLE": TABLE, "LOW": REST.assign(voltage=3.7)}
     parts["FLAT"] = CHARGE.assign(voltage=np.linspace(3.9, 4.2, 60))  # a charge whose voltage jumps more than it rises
@@ -343,9 +346,9 @@ def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter)
     assert read(pd.DataFrame(columns)).charge_C == pytest.approx(charge_C[-1], rel=0.02)
 
 
-@pytest.mark.parametrize(("pulse_s", "found"), [(5, 1), (10, 1), (40, 1), (55, 12)])
-def test_pulses_within_a_charge_are_no_discharges(pulse_s, found):
-    # 360 C and a pulse twelve times, and then the whole discharge; larger ones are cycles
+@pytest.mark.parametrize("pulse_s", [5, 40, 55])
+def test_pulses_within_a_charge_are_no_discharges(pulse_s):
+    # 360 C and a pulse twelve times, and then the whole discharge
     minute_s = np.mod(np.arange(0.0, 3600.0, 5.0), 300.0)
     current_A = np.where(minute_s < 240.0, 1.5, np.where(minute_s < 240.0 + pulse_s, -1.5, 0.0))
     voltage_V = 3.6 + 0.6 * np.cumsum(current_A) / np.cumsum(current_A).max() + 0.05 * current_A
@@ -353,15 +356,15 @@ def test_pulses_within_a_charge_are_no_discharges(pulse_s, found):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         discharges = read_discharges(pd.concat([pulses, REST, CYCLE[len(CHARGE) + len(REST) :]], ignore_index=True))
-    assert len(discharges) == found
-    assert any("within charges" in str(each.message) for each in caught) == (pulse_s == 40)
-    near(discharges[-1], 0.03)
+    assert any("left aside" in str(each.message) for each in caught) == (pulse_s > 5)
+    near(discharges[0], 0.03)
+    assert len(discharges) == 1
 
 
 def test_what_is_left_aside_is_named_and_a_mistake_in_some_cycles_loses_no_other():
     cycle = CYCLE.assign(Cycle=1, current=10.0 * CYCLE["current"])
     small = cycle.assign(current=0.005 * cycle["current"], time=cycle["time"] + 9000.0, Cycle=2)
-    with pytest.warns(UserWarning, match=r"left aside, as they draw less than 1% of the largest: 1 \(0\.072. Ah in rows"):
+    with pytest.warns(UserWarning, match=r"left aside, as they draw less than 10% of the largest: 1 \(0\.072. Ah in rows"):
         (found,) = read_discharges(pd.concat([cycle, small], ignore_index=True))
     assert found.charge_C == pytest.approx(10.0 * RECORD.charge_C, rel=3e-3)
     wrong = cycle.assign(current=1e3 * cycle["current"], time=cycle["time"] - 9000.0, Cycle=0)
@@ -424,16 +427,13 @@ def test_of_a_name_that_comes_twice_in_parquet_neither_is_taken(tmp_path):
         read_discharges(tmp_path / "cell.parquet")
 
 
-@pytest.mark.parametrize(("suffix", "head"), [(".xlsx", b"PK\x03\x04"), (".xls", b"\xd0\xcf\x11\xe0")])
-def test_a_workbook_that_is_damaged_or_needs_an_extra_says_so(suffix, head, tmp_path, monkeypatch):
-    (tmp_path / f"cell{suffix}").write_bytes(head + bytes(100))
-    for missing in ((), ("openpyxl", "xlrd")):
-        for name in missing:
-            monkeypatch.setitem(sys.modules, name, None)
-        with pytest.raises(
-            (ValueError, ImportError), match=r"damaged, or no Excel file|Excel files need .*battery_env\[excel\]"
-        ):
-            read_discharges(tmp_path / f"cell{suffix}")
+def test_a_workbook_that_is_damaged_or_needs_an_extra_says_so(tmp_path, monkeypatch):
+    (tmp_path / "cell.xlsx").write_bytes(b"PK\x03\x04" + bytes(100))
+    with pytest.raises(ValueError, match="damaged, or no Excel file"):
+        read_discharges(tmp_path / "cell.xlsx")
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    with pytest.raises(ImportError, match=r"Excel files need .*battery_env\[excel\]"):
+        read_discharges(tmp_path / "cell.xlsx")
 
 
 def test_a_folder_reads_numbered_text_and_names_what_it_left_out(tmp_path, capsys):

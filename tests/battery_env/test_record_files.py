@@ -82,7 +82,6 @@ COLUMNS = {
     "Basytec": named("~Time[h]", "U[V]", "I[A]", "T1[°C]", (1.0 / 3600.0, 1.0, -1.0)),
     "Landt": named("test_time_s", "voltage_V", "current_A", "temperature_1_C"),
     "another Arbin": named("Test_Time(s)", "Voltage(V)", "Current(A)", "Aux_Temperature(℃)_1"),
-    "Portuguese": named("Tempo_s", "Tensão_V", "Corrente_A", "Temperatura_C"),
     "a clock": CLOCK | {"Time": list(map(clock, TIME_S))},
     "dates": DATES | {"Date_Time": pd.Timestamp("2026-02-28 23:50") + pd.to_timedelta(TIME_S, unit="s")},
 }
@@ -219,13 +218,14 @@ CUT_SHORT = gzip.compress(b"time_s,voltage_V,current_A\n" + 200_000 * b"1,4.1,2\
         ("header.csv", b"time_s,voltage_V,current_A\n", "no rows below the header"),
         ("headless.csv", b"0.0,4.19,0\n1.0,4.18,2\n", "no line with the names of the columns"),
         ("aborted.csv", b"time_s,voltage_V,current_A\n0,4.2,0\n10,4.2,0\n20,4.0,2\n", "needs 5 rows below the header, got 3"),
-        ("text.txt", b"Dear all,\nplease find the data attached.\n", "no column for the time"),
+        ("text.txt", b"Dear all,\nplease find the data attached.\n", "no rows below the header"),
         ("cut.csv.gz", CUT_SHORT, "damaged"),
         ("no.csv.gz", b"time_s,voltage_V,current_A\n", "damaged"),
         ("picture.csv", b"\x89PNG\x00\x00\x0dIHDR", "binary"),
         ("cell.parquet", b"PAR1", "damaged, or no Parquet"),
         ("cell.mat", b"MATLAB", "damaged"),
-        ("cell.h5", b"HDF", "export the records as CSV"),
+        ("cell.h5", b"\x89HDF\x00\x00\x00\x01", "binary.*export the records as CSV"),
+        ("cell.xls", b"\xd0\xcf\x11\xe0\x00\x00\x00\x01", "binary.*a workbook as .xlsx"),
     ],
 )
 def test_what_is_no_table_is_refused_in_one_line(name, content, message, tmp_path):

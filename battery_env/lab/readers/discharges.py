@@ -14,9 +14,9 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import pandas as pd
 
-from battery_env.arrays import BoolArray, FloatArray, IntArray
+from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_LIMITS
-from battery_env.lab.readers.columns import FileFormat, Recognised, find_columns, say
+from battery_env.lab.readers.columns import FileFormat, Recognised, recognise, say
 from battery_env.lab.readers.nasa import read_nasa_mat
 from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, changes, refuse_other_unit, rows_of
 from battery_env.lab.readers.signs import MUCH_SHARE, with_signed_current
@@ -25,7 +25,6 @@ from battery_env.lab.readers.testers import Tester, find_tester
 from battery_env.records import (
     LEAST_LOAD_SHARE,
     LOAD_SHARE,
-    REST_CURRENT_A,
     SWITCH_SHARE,
     ChargeBefore,
     ChargeHistory,
@@ -37,7 +36,6 @@ from battery_env.records.discharge import LEAST_SAMPLES, Discharge
 Made = TypeVar("Made")
 
 # A stretch of charging ends a discharge if it returns more than this share of the charge drawn until then; less is braking.
-# What draws less than this share of the charge before and of the one after is a pulse within a charge.
 _RETURNED_SHARE = 0.2
 # A charge before the load is cut off if it exceeds this share of the charge drawn; a smaller one is sensor offset. A charge
 # within the load ends the discharge only if it returns more than this share of the largest charge drawn: early pulses return
@@ -77,7 +75,7 @@ def read_discharges(
     Read the discharges of a file or of a table.
 
     A table is a ``pandas.DataFrame``, whose index is a column too if it has a name. A file is text with a header (commas,
-    semicolons, tabs or blanks, decimal points or commas, also packed as .gz, .bz2, .xz or .zip), Parquet, one of NASA's .mat
+    semicolons, tabs or blanks, decimal points or commas, also packed as .gz or .zip), Parquet, one of NASA's .mat
     files, with the extra ``excel`` a workbook, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or BioLogic
     (.mpr). Columns go by the names that testers give them; their units are told from the names.
 
@@ -161,7 +159,7 @@ def read_recordings(source: str | Path | pd.DataFrame, file_format: FileFormat) 
             recordings = [Recording(arrays, meta) for arrays, meta in read_nasa_mat(Path(source))]
         else:
             opened = open_frame(source) if isinstance(source, pd.DataFrame) else open_file(Path(source), file_format)
-            known = find_columns(opened.names, file_format, opened.rows, name)
+            known = recognise(opened.names, file_format, opened.rows, name).check()
             recordings = _recordings(name, opened.read(known), known, file_format)
         if not recordings:
             raise ValueError("there is no discharge")
@@ -188,76 +186,65 @@ def _recordings(source: str, table: pd.DataFrame, known: Recognised, file_format
         raise known.refusal(error) from error
 
 
+class _Part(NamedTuple):
+    """Rows of a table that may be a discharge."""
+
+    rows: slice
+    drawn_C: float
+    charge: slice  # the rows of the charge that ends where it begins, empty if there is none
+
+
 def _split(rows: pd.DataFrame, meta: dict[str, Any], vain: frozenset[str]) -> list[Recording]:
     """The discharges among some rows; what is left aside is named."""
-    bounds = _bounds(rows)
-    parts = [part for low, high in itertools.pairwise(bounds) for part in _discharges(rows, low, high)]
+    parts = [part for low, high in itertools.pairwise(_bounds(rows)) for part in _discharges(rows, low, high)]
     if not parts:
         raise ValueError("there is no discharge: no charge is drawn. Check the sign of the current")
     current_A = rows["current"].to_numpy()
+    drawn_C = np.array([part.drawn_C for part in parts])
     # what no cell can draw is refused later, and is no measure of the others
-    of_cells_C = [drawn_C for part, drawn_C in parts if current_A[part].max() <= LOAD_LIMITS["current"]]
-    least_C = FEW_SHARE * max(of_cells_C, default=0.0)
-    passed_C = _passed_C(rows["time"].to_numpy(), current_A)
-    ends_C = [passed_C[[part.start, part.stop - 1]] for part, _ in parts]
-    charged_C = -np.diff(np.concatenate([[0.0], *ends_C, passed_C[-1:]]))[::2]
-    pulses_C = _RETURNED_SHARE * np.minimum(charged_C[:-1], charged_C[1:])
-    drawn_C = np.array([each_C for _, each_C in parts])
-    is_small, is_pulse = drawn_C < least_C, drawn_C < pulses_C
-    _say_left_aside(rows, parts, is_small, f"as they draw less than {FEW_SHARE:.0%} of the largest")
-    _say_left_aside(rows, parts, is_pulse & ~is_small, "as they are pulses within charges")
-    stretches = [part for (part, _), small, pulse in zip(parts, is_small, is_pulse, strict=True) if not (small or pulse)]
-    if not stretches:
-        raise ValueError("there is no discharge: what is drawn are pulses within charges. Check the sign of the current")
-    not_charging = np.maximum.accumulate(np.where(current_A >= 0.0, np.arange(len(rows)), -1))
-    several = len(stretches) > 1
+    of_cells = [current_A[part.rows].max() <= LOAD_LIMITS["current"] for part in parts]
+    is_small = drawn_C < LOAD_SHARE * drawn_C[of_cells].max(initial=0.0)
+    _say_left_aside(rows, [part for part, small in zip(parts, is_small, strict=True) if small], float(drawn_C.max()))
+    parts = [part for part, small in zip(parts, is_small, strict=True) if not small]
+    several = len(parts) > 1
     found = []
-    for number, stretch in enumerate(stretches, start=1):
-        history = ChargeHistory(charge=_charge_before(rows, not_charging, stretch.start))
+    for number, part in enumerate(parts, start=1):
+        history = ChargeHistory(charge=_charge_before(rows, part.charge))
         numbered = meta | ({"cycle": number} if several else {})
-        found.append(_recording(rows.iloc[stretch], history, numbered, several, vain))
+        found.append(_recording(rows.iloc[part.rows], history, numbered, several, vain))
     return found
 
 
-def _say_left_aside(rows: pd.DataFrame, parts: list[tuple[slice, float]], which: BoolArray, why: str) -> None:
+def _say_left_aside(rows: pd.DataFrame, parts: list[_Part], most_C: float) -> None:
     """Name what is no discharge; what draws next to nothing is noise of a sensor."""
-    most_C = max(drawn_C for _, drawn_C in parts)
-    named = [part for part, each in zip(parts, which, strict=True) if each and part[1] > NOTHING_SHARE**2 * most_C]
+    named = [part for part in parts if part.drawn_C > NOTHING_SHARE**2 * most_C]
     if named:
         first = "; ".join(
             f"{drawn_C / 3600.0:.3g} Ah in rows {rows.index[part.start] + 1} to {rows.index[part.stop - 1] + 1}"
-            for part, drawn_C in named[:3]
+            for part, drawn_C, _ in named[:3]
         )
-        say(f"left aside, {why}: {len(named)} ({first}{' and others' if len(named) > 3 else ''})")
+        more = " and others" if len(named) > 3 else ""
+        say(f"left aside, as they draw less than {LOAD_SHARE:.0%} of the largest: {len(named)} ({first}{more})")
 
 
 def _bounds(rows: pd.DataFrame) -> list[int]:
     """
-    Where the number of the cycle changes, and a charge follows, a clock starts anew, or a current that no cell can draw begins
-    or ends; or where no charge is logged, and the voltage is back after it fell: counters may count loops.
+    Where the number of the cycle changes, and a clock starts anew, or a current that no cell can draw begins or ends; or where
+    no charge is logged, and the voltage is back after it fell: counters may count loops.
     """
-    if "cycle" not in rows:
-        return [0, len(rows)]
     time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
-    begin = np.flatnonzero(changes(rows, "cycle") | (np.arange(len(rows)) == 0))
-    highest_V, lowest_V = np.maximum.reduceat(voltage_V, begin), np.minimum.reduceat(voltage_V, begin)
-    most_A = np.maximum.reduceat(np.abs(current_A), begin)
-    is_wrong = most_A > LOAD_LIMITS["current"]
-    # of loads and charges, the last and the next one; a cycle may draw little beside others
-    load_A = np.maximum(LOAD_SHARE * most_A, min(REST_CURRENT_A, LOAD_SHARE * most_A.max()))
-    towards = np.where(current_A > np.repeat(load_A, np.diff([*begin, len(rows)])), 1.0, np.nan)
-    for start, end, _, is_braking in _charges(current_A, _passed_C(time_s, current_A)):
-        towards[start:end] = np.nan if is_braking else -1.0
-    before, after = pd.Series(towards).ffill().to_numpy(), pd.Series(towards).bfill().to_numpy()
-    bounds, top_V, low_V = [0], highest_V[0], lowest_V[0]
-    for n, row in enumerate(begin[1:], start=1):
-        is_back = top_V - highest_V[n] < MUCH_SHARE * (top_V - low_V) and top_V - low_V > MUCH_SHARE * np.ptp(voltage_V)
-        is_other = time_s[row] < time_s[row - 1] or is_wrong[n] != is_wrong[n - 1] or after[row] < 0.0
-        if is_other or (is_back and before[row - 1] > 0.0 and after[row] > 0.0):
-            bounds.append(int(row))
-            top_V, low_V = highest_V[n], lowest_V[n]
-        else:
-            top_V, low_V = max(top_V, highest_V[n]), min(low_V, lowest_V[n])
+    are_charges_logged = any(charge.is_end for charge in _charges(current_A, _passed_C(time_s, current_A)))
+    bounds, numbers = [0], [0, *np.flatnonzero(changes(rows, "cycle")), len(rows)]
+    of_cell, top_V, low_V = True, -np.inf, np.inf
+    for begin, end in itertools.pairwise(numbers):
+        highest_V, lowest_V = voltage_V[begin:end].max(), voltage_V[begin:end].min()
+        was_of_cell, of_cell = of_cell, np.abs(current_A[begin:end]).max() <= LOAD_LIMITS["current"]
+        fell_V = top_V - low_V
+        is_back = fell_V > MUCH_SHARE * np.ptp(voltage_V) and top_V - highest_V < MUCH_SHARE * fell_V
+        if begin and (time_s[begin] < time_s[begin - 1] or of_cell != was_of_cell or (is_back and not are_charges_logged)):
+            bounds.append(int(begin))
+            top_V, low_V = highest_V, lowest_V
+        top_V, low_V = max(top_V, highest_V), min(low_V, lowest_V)
     return [*bounds, len(rows)]
 
 
@@ -267,37 +254,65 @@ def _passed_C(time_s: FloatArray, current_A: FloatArray) -> FloatArray:
     return drawn(clock_s, current_A, clock_s)
 
 
-def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[tuple[slice, float]]:
-    """The discharges among some rows, and the charge that each draws, C."""
+def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[_Part]:
+    """The discharges among some rows: from one charge to the next, without those before the load."""
     time_s, current_A = (rows[name].to_numpy()[low:high] for name in ("time", "current"))
     passed_C = _passed_C(time_s, current_A)
-    charges = _charges(current_A, passed_C)
-    found = list(itertools.pairwise([0, *(start for start, _, is_end, _ in charges if is_end), high - low]))
+    groups: list[list[_Charge]] = [[]]
+    for charge in _charges(current_A, passed_C):
+        groups += [[]] if charge.is_end else []
+        groups[-1].append(charge)
+    begins = [0, *(group[0].start for group in groups[1:]), high - low]
     parts = []
-    for begin, end in found:
-        own = list(itertools.takewhile(lambda each, end=end: each[0] < end, charges))  # type: ignore[misc]
-        charges = charges[len(own) :]
+    for begin, end, charges in zip(begins, begins[1:], groups, strict=False):
         loaded = is_load(current_A[begin:end])
         if not loaded.any():
             continue
-        first = begin + int(loaded.argmax())
+        first, before = begin + int(loaded.argmax()), slice(begin, begin)
         drawn_C = float(passed_C[first:end].max() - passed_C[first])
-        for start, stop, _, is_braking in own:
-            is_before = begin <= start and stop <= (first if is_braking else end)
-            if is_before and passed_C[start] - passed_C[stop - 1] > _CHARGED_SHARE * drawn_C:
-                begin = stop
+        for charge in charges:
+            is_before = charge.stop <= (first if charge.is_braking else end)
+            if is_before and passed_C[charge.start] - passed_C[charge.stop - 1] > _CHARGED_SHARE * drawn_C:
+                begin, before = charge.stop, slice(charge.start, charge.stop)
         if begin < end:
-            parts.append((slice(low + begin, low + end), float(passed_C[begin:end].max() - passed_C[begin])))
+            drawn_C = float(passed_C[begin:end].max() - passed_C[begin])
+            parts.append(_Part(slice(low + begin, low + end), drawn_C, slice(low + before.start, low + before.stop)))
     return parts
 
 
-def _charge_before(rows: pd.DataFrame, not_charging: IntArray, begin: int) -> ChargeBefore | None:
+class _Charge(NamedTuple):
+    """Rows in which the cell is charged."""
+
+    start: int
+    stop: int
+    is_end: bool  # of the discharge before
+    is_braking: bool  # which returns less than was drawn, and ends none
+
+
+def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[_Charge]:
+    """Where the cell is charged, noise at rest left aside."""
+    charging = np.concatenate([[False], current_A < 0.0, [False]])
+    starts, ends = np.flatnonzero(~charging[:-1] & charging[1:]), np.flatnonzero(charging[:-1] & ~charging[1:])
+    counts = passed_C[starts] - passed_C[ends - 1] > NOTHING_SHARE * float(np.ptp(passed_C))
+    least_C = _CHARGED_SHARE * float((passed_C - np.minimum.accumulate(passed_C)).max())
+    found, lowest_C, highest_C = [], passed_C[0], passed_C[0]
+    for start, end in zip(starts[counts].tolist(), ends[counts].tolist(), strict=True):
+        drawn_C, highest_C = passed_C[start] - lowest_C, max(highest_C, passed_C[start])
+        returned_C = passed_C[start] - passed_C[end - 1]
+        # a charge may be logged in many steps, of which each returns little
+        is_end = drawn_C > 0.0 and returned_C > _RETURNED_SHARE * drawn_C and highest_C - passed_C[end - 1] > least_C
+        found.append(_Charge(start, end, bool(is_end), bool(not is_end and returned_C < drawn_C)))
+        lowest_C = passed_C[start] if is_end else lowest_C
+        if passed_C[end - 1] < lowest_C:
+            lowest_C = highest_C = passed_C[end - 1]
+    return found
+
+
+def _charge_before(rows: pd.DataFrame, part: slice) -> ChargeBefore | None:
     """The charge that ends where a discharge begins, if it is in the table and no mere noise."""
-    start = int(not_charging[begin - 1]) + 1 if begin else 0
-    time_s, voltage_V, current_A = (rows[each].to_numpy()[start:begin] for each in ("time", "voltage", "current"))
-    if not (current_A < -LEAST_LOAD_SHARE * np.abs(rows["current"].to_numpy()).max()).any():
-        return None
-    return ChargeBefore.of(time_s, voltage_V, current_A)
+    time_s, voltage_V, current_A = (rows[each].to_numpy()[part] for each in ("time", "voltage", "current"))
+    is_noise = not (current_A < -LEAST_LOAD_SHARE * rows["current"].abs().max()).any()
+    return None if is_noise else ChargeBefore.of(time_s, voltage_V, current_A)
 
 
 def _recording(
@@ -325,50 +340,18 @@ def _recording(
 
 
 def _with_count(history: ChargeHistory, rows: pd.DataFrame, vain: frozenset[str]) -> ChargeHistory:
-    """With how much the charge under load is another one than the tester counted row by row."""
+    """With how much the charge under load is another one than the tester counted row by row; it may count anew with a step."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(is_load(current_A))
-    if len(loaded) < LEAST_SAMPLES:  # of values that no cell has, which are refused later
-        return history
     part = slice(loaded[0], loaded[-1] + 1)
-    step_C = np.diff(rows["capacity"].to_numpy()[part])
-    step_C = step_C if (step_C > 0.0).sum() > (step_C < 0.0).sum() else -step_C  # a counter may count down
-    if (step_C > 0.0).mean() < 0.5:
+    step_C, passed_C = np.diff(rows["capacity"].to_numpy()[part]), np.diff(drawn(time_s, current_A, time_s)[part])
+    if len(loaded) < LEAST_SAMPLES or (step_C > 0.0).mean() < 0.5:
         return history
-    goes_on = step_C >= 0.0
-    is_counted = bool(goes_on.all())
-    if not is_counted:  # but anew with each step, of which the last row may be missing
-        goes_on &= np.abs(np.diff(current_A[part])) <= SWITCH_SHARE * current_A.max()
-    counted_C = float(step_C[goes_on].sum())
-    # some count what is drawn alone, others what is returned, too
-    passed_C = [drawn(time_s[part], each[part], time_s[part]) for each in (np.maximum(current_A, 0.0), np.abs(current_A))]
-    off_C = min((float(np.diff(each)[goes_on].sum()) - counted_C for each in passed_C), key=abs)
-    if abs(off_C) > FEW_SHARE * counted_C:
-        counted_Ah, passed_Ah = counted_C / 3600.0, (counted_C + off_C) / 3600.0
+    goes_on = (step_C >= 0.0) & (passed_C >= 0.0) & (np.abs(np.diff(current_A[part])) <= SWITCH_SHARE * current_A.max())
+    counted_Ah, passed_Ah = step_C[goes_on].sum() / 3600.0, passed_C[goes_on].sum() / 3600.0
+    if abs(passed_Ah - counted_Ah) > FEW_SHARE * counted_Ah:
         told = f"the tester counted {counted_Ah:.4g} Ah, where current and time make {passed_Ah:.4g} Ah"
         if "--units time=" not in vain:
             refuse_other_unit(counted_Ah, passed_Ah, told)
         say(f"{told}: check units and clock, and that all rows are there")
-    return history._replace(is_counted=is_counted, uncounted_C=abs(off_C))
-
-
-def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[tuple[int, int, bool, bool]]:
-    """
-    Where the cell is charged, noise at rest left aside: the first sample, the one after the last, whether that ends a
-    discharge, and whether it is braking, which returns less than was drawn and ends none.
-    """
-    charging = np.concatenate([[False], current_A < 0.0, [False]])
-    starts, ends = np.flatnonzero(~charging[:-1] & charging[1:]), np.flatnonzero(charging[:-1] & ~charging[1:])
-    counts = passed_C[starts] - passed_C[ends - 1] > NOTHING_SHARE * float(np.ptp(passed_C))
-    least_C = _CHARGED_SHARE * float((passed_C - np.minimum.accumulate(passed_C)).max())
-    found, lowest_C, highest_C = [], passed_C[0], passed_C[0]
-    for start, end in zip(starts[counts].tolist(), ends[counts].tolist(), strict=True):
-        drawn_C, highest_C = passed_C[start] - lowest_C, max(highest_C, passed_C[start])
-        returned_C = passed_C[start] - passed_C[end - 1]
-        # a charge may be logged in many steps, of which each returns little
-        is_end = drawn_C > 0.0 and returned_C > _RETURNED_SHARE * drawn_C and highest_C - passed_C[end - 1] > least_C
-        found.append((start, end, bool(is_end), bool(not is_end and returned_C < drawn_C)))
-        lowest_C = passed_C[start] if is_end else lowest_C
-        if passed_C[end - 1] < lowest_C:
-            lowest_C = highest_C = passed_C[end - 1]
-    return found
+    return history._replace(is_counted=bool((step_C >= 0.0).all()), uncounted_C=3600.0 * abs(passed_Ah - counted_Ah))

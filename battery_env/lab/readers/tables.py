@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import bz2
 import csv
 import gzip
 import io
-import lzma
 import re
 import warnings
 import zipfile
@@ -16,23 +14,24 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple, cast
+from typing import IO, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import pandas as pd
 
 from battery_env.files import LARGEST_UNPACKED_BYTES
 from battery_env.lab.readers.columns import FileFormat, Recognised, are_units, count_required, say
-from battery_env.lab.readers.testers import ENCODINGS, REQUIRED
+from battery_env.lab.readers.testers import ENCODINGS
 
-#: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .bz2, .xz, .zip).
-#: Text of Maccor's is numbered.
-TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".dta", ".bdf")
+Key = TypeVar("Key")
+
+#: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .zip). Text of
+#: Maccor's is numbered, and some call theirs .xls.
+TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".dta", ".bdf", ".xls")
 NUMBERED_SUFFIXES = tuple(f".{number:03d}" for number in range(1000))
-BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr", ".xlsx", ".xls")
-PACKED_SUFFIXES = (".gz", ".bz2", ".xz", ".zip")
+BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr", ".xlsx")
+PACKED_SUFFIXES = (".gz", ".zip")
 
-_OPENERS: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open, ".xz": lzma.open}
 # Testers write what they know about a test above the table: its header is searched in so many lines of so many bytes each. A
 # table is known by so many of its rows.
 _HEAD_LINES, _LINE_BYTES, _FIRST_ROWS = 2000, 128, 400
@@ -40,12 +39,8 @@ _HEAD_LINES, _LINE_BYTES, _FIRST_ROWS = 2000, 128, 400
 _MOST_ROWS, _LEAST_ROW_BYTES, _MOST_COLUMNS = 3_000_000, 20, 2000
 _BLANKS = r"\s+"
 _DELIMITERS = (",", ";", "\t", "|", _BLANKS)
+_NUMBER = re.compile(r"[-+]?[\d.,]*\d[.,]?(?:[eE][-+]?\d+)?$")
 _ITS_COMMA = re.compile(r"^(\s*[-+]?\d*),(?=\d)")
-_DECIMAL_COMMA = re.compile(r"^\s*[-+]?\d+,\d+(?:[eE][-+]?\d+)?\s*$")
-_NUMBER = re.compile(r"^\s*[-+]?\d*\.?\d+\.?(?:[eE][-+]?\d+)?(?:[;\s]|$)")
-# How workbooks begin; text is called .xls by some testers.
-_WORKBOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
-_EXPORT = {".res": "export the channel as CSV in MITS Pro", ".h5": "export the records as CSV"}
 
 
 class TooLargeError(ValueError):
@@ -63,18 +58,15 @@ class Opened(NamedTuple):
 def open_file(path: Path, file_format: FileFormat) -> Opened:
     """Read the beginning of a file."""
     suffix = path.suffix.lower()
-    if suffix in _EXPORT:
-        raise ValueError(f"{suffix} files cannot be read: {_EXPORT[suffix]}")
-    if suffix in (".ndax", ".xlsx", ".xls"):
+    if suffix in (".ndax", ".xlsx"):
         _check_archive(path)
     if suffix == ".parquet":
-        return _open_parquet(path)
+        return open_frame(_read_parquet(path))
     if suffix in (".nda", ".ndax", ".mpr"):
         return open_frame(_read_biologic(path) if suffix == ".mpr" else _read_neware(path))
-    content = _content(path)
-    if suffix in (".xlsx", ".xls") and content.startswith(_WORKBOOKS):
-        return open_frame(_sheet(path, file_format))
-    return _open_text(_text_of(content), file_format)
+    if suffix == ".xlsx":
+        return open_frame(_read_workbook(path, file_format))
+    return _open_text(_text_of(path), file_format)
 
 
 def open_frame(table: pd.DataFrame) -> Opened:
@@ -108,31 +100,25 @@ def _check_unpacked(count: int) -> None:
 def _content(path: Path) -> bytes:
     """The content of a file, unpacked."""
     parts, count, lines = [], 0, 0
-    try:
-        with _open(path) as stream:
-            while part := stream.read(1 << 20):
-                parts.append(part)
-                count += len(part)
-                lines += max(part.count(b"\n"), part.count(b"\r"))  # as on old computers, too
-                _check_rows(lines, count)
-                if path.suffix.lower() in PACKED_SUFFIXES:
-                    _check_unpacked(count)
-    except (FileNotFoundError, IsADirectoryError, PermissionError, TooLargeError):
-        raise
-    except Exception as error:  # the unpackers raise whatever the damage leads them to
-        raise ValueError(f"the file is damaged: {str(error).strip() or type(error).__name__}") from error
+    with _reading("packed text"), _open(path) as stream:
+        while part := stream.read(1 << 20):
+            parts.append(part)
+            count += len(part)
+            lines += max(part.count(b"\n"), part.count(b"\r"))  # as on old computers, too
+            _check_rows(lines, count)
+            if path.suffix.lower() in PACKED_SUFFIXES:
+                _check_unpacked(count)
     return b"".join(parts)
 
 
 def _open(path: Path) -> IO[bytes]:
-    suffix = path.suffix.lower()
-    if suffix == ".zip":
+    if path.suffix.lower() == ".zip":
         archive = zipfile.ZipFile(path)
         names = archive.namelist()
         if len(names) != 1:
             raise ValueError(f"the archive must hold one file, got {len(names)}")
         return archive.open(names[0])
-    return cast(IO[bytes], _OPENERS.get(suffix, open)(path, "rb"))
+    return cast(IO[bytes], gzip.open(path) if path.suffix.lower() == ".gz" else path.open("rb"))
 
 
 def _check_archive(path: Path) -> None:
@@ -162,66 +148,60 @@ def check_mat(path: Path) -> None:
             stream.seek(end)
 
 
-def _text_of(content: bytes) -> bytes:
-    """A text without what is no character."""
+def _text_of(path: Path) -> bytes:
+    """The text of a file without what is no character."""
+    content = _content(path)
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         content = content.decode("utf-16", errors="ignore").encode()
     kept = content.rstrip(b"\0")  # what a power cut leaves of the end
     if 10 * kept.count(b"\0") > len(kept):
-        raise ValueError("the file is binary, and its ending is none of those that can be read")
+        raise ValueError(
+            "the file is binary, and none of those that can be read: export the records as CSV, a workbook as .xlsx"
+        )
     kept = kept.replace(b"\0", b"")
     if len(kept) < len(content):
         say(f"{len(content) - len(kept)} NUL bytes, which are no text, are left out")
-    if b"\n" not in kept[: _HEAD_LINES * _LINE_BYTES]:  # lines may end as on old computers, too
-        kept = kept.replace(b"\r", b"\n")
     return kept.replace("\u2212".encode(), b"-")  # the sign of typographers
 
 
 def _open_text(content: bytes, file_format: FileFormat) -> Opened:
-    """The first encoding is taken in which the beginning of a text has the names of a record."""
+    """In UTF-8, or in the encoding in which the beginning of the text has the names of a record."""
     stated = file_format.tester and file_format.tester.encoding
-    opened = []
+    tables: dict[tuple[str, str], list[list[str]]] = {}
     for encoding in [stated] if stated else ["utf-8", *ENCODINGS]:
         try:
             # the head may end within a character
             head = getincrementaldecoder(encoding)().decode(content[: _HEAD_LINES * _LINE_BYTES], final=False)
-        except LookupError as error:
-            raise ValueError(f"the encoding {encoding!r} is not known") from error
-        except UnicodeDecodeError:
+        except (LookupError, UnicodeDecodeError) as error:
+            if stated:
+                raise ValueError(f"the file is no text in {stated}: {error}") from error
             continue
-        opened.append(_open_as(content, head.removeprefix("\ufeff"), encoding, file_format))
-        if encoding == "utf-8" or count_required(opened[-1].names, file_format) == len(REQUIRED):
-            return opened[-1]
-    if not opened:
-        raise ValueError(f"the file is no text in {stated}")
-    return opened[0]
-
-
-def _open_as(content: bytes, head: str, encoding: str, file_format: FileFormat) -> Opened:
-    lines = io.StringIO(head, newline=None).read().split("\n")[: _HEAD_LINES + _FIRST_ROWS]
-    tables = {delimiter: [_fields(line, delimiter) for line in lines] for delimiter in _DELIMITERS}
-    delimiter, number = _find_header(tables, file_format)
-    names, rows = tables[delimiter][number], tables[delimiter][number + 1 :][:_FIRST_ROWS]
+        lines = io.StringIO(head.removeprefix("\ufeff"), newline=None).read().split("\n")[: _HEAD_LINES + _FIRST_ROWS]
+        tables |= {(encoding, delimiter): [_fields(line, delimiter) for line in lines] for delimiter in _DELIMITERS}
+        if encoding == "utf-8":
+            break
+    (encoding, delimiter), number = _find_header(tables, file_format)
+    names, *rows = tables[encoding, delimiter][number : number + 1 + _FIRST_ROWS]
     _check(len(names), _MOST_COLUMNS, "columns")
     has_units = bool(rows) and are_units(rows[0])
-    values = [row for row in rows[has_units:] if any(row)]
+    values = [row for row in rows[has_units:] if row]
     if not values:
         raise ValueError("there are no rows below the header")
     if not names[0] and 0 < 2 * sum(row[0] != "" for row in values) < len(values):
         raise ValueError("rows of cycles, steps and records are in one table: export the records alone")
-    wider = [len(row) for row in values if any(row[len(names) :])]
+    wider = [len(row) for row in values if len(row) > len(names)]
     if 2 * len(wider) > len(values):
         raise ValueError(
             f"rows have {wider[0]} fields below {len(names)} names, which does not tell what is what: name each column, and "
             "take another delimiter than the decimal comma"
         )
-    commas = sum(bool(_DECIMAL_COMMA.match(field)) for row in values for field in row)
+    numbers = [field for row in values for field in row if _NUMBER.match(field)]
     options: dict[str, Any] = {
         "sep": delimiter,
-        "decimal": "," if commas > len(values) / 2 and delimiter != _BLANKS else ".",
+        "decimal": "," if 2 * sum("," in field for field in numbers) > len(numbers) else ".",
         "encoding": encoding,
         "skiprows": number + 1 + has_units,
-        "names": range(max(map(len, values))),
+        "names": range(max(map(len, [names, *values]))),
     }
     return Opened(names, rows, lambda found: _read_text(content, options, found))
 
@@ -248,39 +228,31 @@ def _read_text(content: bytes, options: dict[str, Any], found: Recognised) -> pd
     return pd.DataFrame({key: table[column.position] for key, column in found.columns.items()})
 
 
-class _Header(NamedTuple):
-    """A row that may hold the names of the columns, and what speaks for it, the most telling first."""
-
-    quantities: int  # of a record, so many
-    fits: int  # so many of the rows below hold numbers in as many fields
-    nearness: int  # to them
-    table: str
-
-
-def _find_header(tables: Mapping[str, Sequence[Sequence[str]]], file_format: FileFormat) -> tuple[str, int]:
-    """In which of some tables, by delimiter or by sheet, and in which of its rows the names of the columns are."""
-    candidates: dict[tuple[str, ...], _Header] = {}  # by names, which may come again
+def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: FileFormat) -> tuple[Key, int]:
+    """
+    In which of some tables, by delimiter or by sheet, and in which of its rows the names of the columns are: those of most
+    quantities of a record, above most rows of numbers in as many fields.
+    """
+    candidates: dict[tuple[str, ...], tuple[int, int, int, Key]] = {}  # by names, which may come again
     has_numbers = False
     for key, rows in tables.items():
-        counts = [sum(bool(_NUMBER.match(field) or _DECIMAL_COMMA.match(field)) for field in row) for row in rows]
-        is_row = np.array(counts) > 1
-        has_numbers |= bool(is_row.any())
-        # a delimiter may end each
-        widths = np.array([(len(row), len([*filter(None, row)])) for row in rows]).reshape(-1, 2)
-        for n in [n for n, row in enumerate(rows[:_HEAD_LINES]) if any(row) and not counts[n]]:
-            below = slice(n + 1, n + 1 + _FIRST_ROWS)
-            fits = int((is_row[below] & (widths[below] == widths[n]).any(axis=1)).sum())
-            found = _Header(count_required(rows[n], file_format), fits, n if fits else -n, key)
-            candidates.setdefault(tuple(filter(None, rows[n])), found)
-    best = max(candidates.values(), key=lambda each: each[:3], default=_Header(0, 0, 0, ""))
-    if has_numbers and not (best.quantities or best.fits):
-        raise ValueError("there is no line with the names of the columns above the numbers. Add one")
-    if not candidates:
+        counts = np.array([sum(bool(_NUMBER.match(field)) for field in row) for row in rows])
+        widths = np.where(counts > 1, [*map(len, rows)], 0)
+        has_numbers |= bool(widths.any())
+        for n, row in enumerate(rows[:_HEAD_LINES]):
+            if any(row) and not counts[n]:
+                fits = int((widths[n + 1 : n + 1 + _FIRST_ROWS] == len(row)).sum())
+                candidates.setdefault(tuple(row), (count_required(row, file_format), fits, n, key))
+    if not candidates and not has_numbers:
         raise ValueError("the file is empty")
-    first = next(each for each in candidates.values() if each.quantities == best.quantities)
-    if best.quantities and first != best:
-        say(f"the header is line {abs(best.nearness) + 1}; the table of line {abs(first.nearness) + 1} is left out")
-    return best.table, abs(best.nearness)
+    best = max(candidates.values(), key=lambda each: each[:3], default=(0, 0, 0, None))
+    if has_numbers and not any(best[:2]):
+        raise ValueError("there is no line with the names of the columns above the numbers. Add one")
+    quantities, _, number, key = best
+    first = next(each[2] for each in candidates.values() if each[0] == quantities)
+    if quantities and first != number:
+        say(f"the header is line {number + 1}; the table of line {first + 1} is left out")
+    return cast(Key, key), number
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
@@ -289,48 +261,53 @@ def _fields(line: str, delimiter: str) -> list[str]:
         fields = line.split() if delimiter == _BLANKS else next(csv.reader([line], delimiter=delimiter), [])
     except csv.Error:
         return []
-    return [field.strip().strip('"') for field in fields]
+    return _filled([field.strip().strip('"') for field in fields])
+
+
+def _filled(fields: list[str]) -> list[str]:
+    """Without what is empty at the end, where some write a delimiter."""
+    while fields and not fields[-1]:
+        fields.pop()
+    return fields
 
 
 @contextmanager
-def _reading(kind: str, extra: str) -> Iterator[None]:
+def _reading(kind: str, extra: str = "") -> Iterator[None]:
     """Of what others read: their own warnings are not passed on, and what is missing, or not as it should be, is named."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except (FileNotFoundError, TooLargeError):
+    except (FileNotFoundError, IsADirectoryError, PermissionError, TooLargeError):
         raise
     except ImportError as error:
         raise ImportError(f"{kind} files need an extra: pip install 'battery_env[{extra}]' ({error})") from error
-    except NotImplementedError as error:
-        raise ValueError(f"what reads {kind} files does not know all of this one: {error}") from error
     except Exception as error:  # whatever the damage leads to
-        raise ValueError(f"the file is damaged, or no {kind} file: {str(error).strip()}") from error
+        raise ValueError(f"the file is damaged, or no {kind} file: {str(error).strip() or type(error).__name__}") from error
 
 
-def _sheets(path: Path) -> dict[str, list[list[str]]]:
-    """The rows of each sheet, as wide as they are filled: a single cell may lie in the last corner of a sheet."""
+def _read_workbook(path: Path, file_format: FileFormat) -> pd.DataFrame:
+    """The sheet of a workbook that holds the record, and those that continue it."""
     with _reading("Excel", "excel"):
-        if path.read_bytes()[:4] != _WORKBOOKS[0]:
-            tables = pd.read_excel(path, sheet_name=None, header=None, engine="xlrd")
-            return {str(title): _rows_of_sheet(title, table.to_numpy()) for title, table in tables.items()}
         import openpyxl
 
         with closing(openpyxl.load_workbook(path, read_only=True, data_only=True)) as book:
             for sheet in book.worksheets:
-                sheet.reset_dimensions()
-            return {sheet.title: _rows_of_sheet(sheet.title, sheet.iter_rows(values_only=True)) for sheet in book.worksheets}
+                sheet.reset_dimensions()  # which a single cell in the last corner makes
+            sheets = {sheet.title: _rows_of_sheet(sheet.title, sheet.iter_rows(values_only=True)) for sheet in book.worksheets}
+    title, line = _find_header({each: rows[: _HEAD_LINES + _FIRST_ROWS] for each, rows in sheets.items()}, file_format)
+    header = sheets[title][line]
+    parts = [rows[rows.index(header) + 1 :] for rows in sheets.values() if header in rows[:_HEAD_LINES]]
+    width = len(header)
+    return pd.DataFrame([[*row, *[""] * width][:width] for rows in parts for row in rows], columns=header)
 
 
 def _rows_of_sheet(title: object, rows: Iterable[Sequence[Any]]) -> list[list[str]]:
-    """The rows of a sheet that are filled; refused where it is too large."""
+    """The rows of a sheet as far as they are filled; refused where it is too large."""
     kept: list[list[str]] = []
     size = 0
     for row in rows:
-        fields = ["" if value is None or value != value else " ".join(str(value).split()) for value in row]
-        while fields and not fields[-1]:
-            fields.pop()
+        fields = _filled(["" if value is None else " ".join(str(value).split()) for value in row])
         _check(len(fields), _MOST_COLUMNS, f"columns in sheet {title!r}")
         if fields:
             kept.append(fields)
@@ -339,47 +316,21 @@ def _rows_of_sheet(title: object, rows: Iterable[Sequence[Any]]) -> list[list[st
     return kept
 
 
-def _sheet(path: Path, file_format: FileFormat) -> pd.DataFrame:
-    """The sheet of a workbook that holds the record, and those that continue it."""
-    sheets = _sheets(path)
-    title, line = _find_header({each: rows[: _HEAD_LINES + _FIRST_ROWS] for each, rows in sheets.items()}, file_format)
-    header = sheets[title][line]
-    parts = [rows[rows.index(header) + 1 :] for rows in sheets.values() if header in rows[:_HEAD_LINES]]
-    width = len(header)
-    return pd.DataFrame([[*row[:width], *[""] * (width - len(row))] for rows in parts for row in rows], columns=header)
-
-
-def _open_parquet(path: Path) -> Opened:
-    """A file whose footer says how large its columns are; text is kept once, however often it comes."""
+def _read_parquet(path: Path) -> pd.DataFrame:
+    """A table whose footer says how large it is; text is kept once, however often it comes."""
     with _reading("Parquet", "parquet"):
         from pyarrow import parquet, types
 
         with parquet.ParquetFile(path) as file:
             metadata, fields = file.metadata, list(file.schema_arrow)
-    _check_rows(metadata.num_rows, path.stat().st_size)
-    sizes: Counter[str] = Counter()
-    for group in map(metadata.row_group, range(metadata.num_row_groups)):
-        for chunk in map(group.column, range(metadata.num_columns)):
-            sizes[chunk.path_in_schema.split(".")[0]] += chunk.total_uncompressed_size
-    text = [each.name for each in fields if types.is_string(each.type) or types.is_large_string(each.type)]
-    is_plain = {each.name: not types.is_nested(each.type) and not types.is_binary(each.type) for each in fields}
-    counts = Counter(each.name for each in fields)  # of a name that comes twice nothing tells which is meant
-    usable = {name for name in counts if is_plain[name] and counts[name] == 1 and sizes[name] <= LARGEST_UNPACKED_BYTES // 8}
-    names = [each.name if each.name in usable else "" for each in fields]
-
-    def read(wanted: Sequence[str], most_rows: int) -> pd.DataFrame:
-        with _reading("Parquet", "parquet"), parquet.ParquetFile(path, read_dictionary=text) as file:
-            batch = next(file.iter_batches(max(most_rows, 1), columns=wanted), None)
-            # the metadata of pandas would make an index of a column
-            return pd.DataFrame(columns=[*wanted]) if batch is None else batch.to_pandas(ignore_metadata=True)
-
-    def read_columns_of(found: Recognised) -> pd.DataFrame:
-        name_of = {key: names[column.position] for key, column in found.columns.items()}
-        table = read(sorted({*name_of.values()}), metadata.num_rows)
-        return pd.DataFrame({key: table[name] for key, name in name_of.items()})
-
-    head = read([*filter(None, names)], _FIRST_ROWS)
-    return Opened(names, _first_rows(head.reindex(columns=names)), read_columns_of)
+        _check_rows(metadata.num_rows, path.stat().st_size)
+        _check(metadata.num_rows * len(fields), max(LARGEST_UNPACKED_BYTES // 8, path.stat().st_size), "values")
+        _check_unpacked(sum(metadata.row_group(n).total_byte_size for n in range(metadata.num_row_groups)))
+        counts = Counter(each.name for each in fields)  # of a name that comes twice nothing tells which is meant
+        names = [each.name for each in fields if counts[each.name] == 1 and not types.is_nested(each.type)]
+        text = [each.name for each in fields if types.is_string(each.type) or types.is_large_string(each.type)]
+        # the metadata of pandas would make an index of a column
+        return parquet.read_table(path, columns=names, read_dictionary=text).to_pandas(ignore_metadata=True)
 
 
 def _read_neware(path: Path) -> pd.DataFrame:

@@ -48,12 +48,9 @@ class Tester:
     missing: Sequence[str] = ()
 
 
-def _row(
-    name: str, told_by: str, negative: bool | None = None, encoding: str = "", missing: str = "", count: str = "", **names: str
-) -> Tester:
+def _row(name: str, told_by: str, negative: bool | None = None, encoding: str = "", missing: str = "", **names: str) -> Tester:
     columns = {quantity: _listed(text) for quantity, text in names.items()}
-    units = {"capacity": count} if count else {}
-    return Tester(name, columns, _listed(told_by), units, negative, encoding, _listed(missing))
+    return Tester(name, columns, _listed(told_by), {}, negative, encoding, _listed(missing))
 
 
 def _listed(text: str) -> list[str]:
@@ -63,13 +60,13 @@ def _listed(text: str) -> list[str]:
 # Names that are plain, too, are only in the row of these, but for clocks, of which that of the test comes first.
 _KNOWN = (
     _row(
-        "Arbin", "Data_Point, dV/dt", negative=True, count="Ah", time="Test_Time", date="Date_Time",
+        "Arbin", "dV/dt, Is_FC_Data, ACI_Phase_Angle", negative=True, time="Test_Time", date="Date_Time",
         temperature="Aux_Temperature_1, Aux_Temperature", cell="Channel_ID",
     ),
     _row(
-        "Maccor", "DPT Time, Amp-hr, Rec#, Cycle P", missing="N/A", count="Ah", time="TestTime, Test", date="DPT Time",
-        voltage="Volts, mVolts", current="Amps, mAmps", capacity="Amp-hr, Cap.",
-        temperature="Temp 1, EV Temp", cycle="Cyc#, Cycle P, Cycle C", state="State, Md",
+        "Maccor", "DPT Time, Amp-hr, Rec#, Cycle P", missing="N/A", time="TestTime, Test", date="DPT Time",
+        voltage="Volts, mVolts", current="Amps, mAmps", temperature="Temp 1, EV Temp", capacity="Amp-hr, Cap.",
+        cycle="Cyc#, Cycle P, Cycle C", state="State, Md",
     ),
     _row(
         "BioLogic", "Ewe, Ecell, Ewe-Ece, <Ewe>, Ns changes", negative=True, encoding="latin-1", time="time",
@@ -100,8 +97,7 @@ _KNOWN = (
     ),
     _row(
         "Landt", "channel_index, SysTime, Step-State, 测试时间", encoding="gb18030", time="TestTime, 测试时间",
-        date="SysTime, Date Time ISO string, 系统时间", temperature="Temperature 1",
-        state="Step Name, StepMode, Step-State",
+        date="SysTime, Date Time ISO string, 系统时间", temperature="Temperature 1", state="Step Name, StepMode, Step-State",
     ),
     _row(
         "PEC", "Load On Time, Position Start Time", negative=True, time="Total Time", date="Real Time",
@@ -121,24 +117,19 @@ _KNOWN = (
 )  # fmt: skip
 _PLAIN = _row(
     "plain", "", encoding="latin-1", missing="--, ---, N/A, n.a., -",
-    time="time, total time, elapsed time, accumulated time, record time, elapsed, test, relative time, seconds, t, testzeit, "
-    "prüfzeit, gesamtzeit, laufzeit, zeit, temps total, temps, tempo, tiempo",
-    date="date time, timestamp, date, absolute time, system time, datum, datum uhrzeit, fecha",
-    voltage="voltage, cell voltage, terminal voltage, battery voltage, voltage measured, measured voltage, volts, volt, u, v, "
-    "cell potential, u cell, v cell, u bat, v bat, u batt, v batt, spannung, zellspannung, klemmenspannung, u zelle, "
-    "batteriespannung, tension, tension cellule, tensión, tensão, tensao, voltaje",
-    current="current, cell current, battery current, current measured, measured current, curr, amps, amp, i, i cell, i bat, "
-    "i batt, strom, zellstrom, batteriestrom, courant, corriente, corrente",
+    time="time, total time, elapsed time, elapsed, test, relative time, seconds, t, testzeit, laufzeit, zeit",
+    date="date time, timestamp, date, absolute time, system time, datum, datum uhrzeit",
+    voltage="voltage, cell voltage, terminal voltage, battery voltage, voltage measured, volts, volt, u, v, cell potential, "
+    "u cell, v cell, spannung, zellspannung, klemmenspannung",
+    current="current, cell current, battery current, current measured, amps, amp, i, i cell, strom, zellstrom",
     power="power, p, leistung",
-    temperature="temperature, cell temperature, temperature measured, surface temperature, temp, temp 1, t1, t cell, t, "
-    "temperatur, zelltemperatur, température, temperatura",
-    ambient="ambient temperature, chamber temperature, environment temperature, umgebungstemperatur",
-    capacity="discharge capacity, discharged capacity, capacity, cap, ah, entladekapazität, kapazität",
-    cycle="cycle, cycle index, cycle number, cycle no, cycle count, cyc, zyklus, zyklusnummer, ciclo",
-    step="step, step index, step number, step no, steps, schritt, schrittnummer, etape, étape",
-    state="state, status, mode, step type, zustand, betriebsart, modus, estado, état, etat",
-    cell="cell id, cell name, cell number, cell no, cell, battery id, battery, barcode, serial number, channel, "
-    "channel number, zelle",
+    temperature="temperature, cell temperature, temperature measured, surface temperature, temp, temp 1, t1, t, temperatur",
+    ambient="ambient temperature, chamber temperature, umgebungstemperatur",
+    capacity="discharge capacity, capacity, cap, ah, entladekapazität, kapazität",
+    cycle="cycle, cycle index, cycle number, cycle no, cycle count, cyc, zyklus",
+    step="step, step index, step number, step no, schritt",
+    state="state, status, mode, step type, zustand, betriebsart, modus",
+    cell="cell id, cell name, cell number, cell no, cell, battery id, barcode, serial number, channel, zelle",
 )  # fmt: skip
 
 
@@ -164,39 +155,31 @@ def find_tester(name: str | Path | Tester | None) -> Tester | None:
     for tester in TESTERS:
         if tester.name.lower() == str(name).strip().lower():
             return joined(tester, TESTERS[-1])
-    path = Path(name)
-    if not path.is_file():
-        known = ", ".join(tester.name for tester in TESTERS)
-        raise FileNotFoundError(f"no file {str(name)!r}, nor a tester of this name: known are {known}")
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # of the encoding, or of TOML
-        raise ValueError(f"{path} is no file in TOML: {error}") from error
-    return _checked(path, content)
+        return _tester_of(Path(name).stem, tomllib.loads(Path(name).read_text(encoding="utf-8")))
+    except FileNotFoundError as error:
+        known = ", ".join(tester.name for tester in TESTERS)
+        raise FileNotFoundError(f"no file {str(name)!r}, nor a tester of this name: known are {known}") from error
+    except ValueError as error:  # of the encoding, of TOML, or of what it says
+        raise ValueError(f"{name} is no file of a tester in TOML: {error}") from error
 
 
-def _checked(path: Path, content: dict[str, Any]) -> Tester:
+def _tester_of(name: str, content: dict[str, Any]) -> Tester:
     kinds = dict(name=str, columns=dict, units=dict, discharge_is_negative=bool, encoding=str, missing=list)
     for key, value in content.items():
         if key not in kinds or not isinstance(value, kinds[key]):
             known = ", ".join(f"{name} ({kind.__name__})" for name, kind in kinds.items())
-            raise ValueError(f"{path}: a tester has {known}, got {key} = {value!r}")
+            raise ValueError(f"a tester has {known}, got {key} = {value!r}")
     columns, units = content.get("columns", {}), content.get("units", {})
     for key, value in (*columns.items(), *units.items()):
         if key not in QUANTITIES or not isinstance(value, str):
-            raise ValueError(f"{path}: names and units are text by quantity ({', '.join(QUANTITIES)}), got {key} = {value!r}")
-    listed = {"columns": {quantity: [name] for quantity, name in columns.items()}}
-    return joined(Tester(**{"name": path.stem} | content | listed), TESTERS[-1])
+            raise ValueError(f"names and units are text by quantity ({', '.join(QUANTITIES)}), got {key} = {value!r}")
+    listed = {"columns": {quantity: [text] for quantity, text in columns.items()}}
+    return joined(Tester(**{"name": name} | content | listed), TESTERS[-1])
 
 
 def tester_file(columns: Mapping[str, Any], names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """
-    A file in TOML to fill in.
-
-    :param columns: what was recognised, by quantity, with a ``name`` and a ``unit``
-    :param names: all names of the table
-    :param rows: its first rows
-    """
+    """A file in TOML to fill in, with what was recognised of a table, by quantity, below its names and its first rows."""
     lines = [
         "# A tester for battery-calibrate --tester: its columns by name, and units that the names do not tell.",
         *(f"# {_quoted(', '.join(fields)[:200])}" for fields in (names, *rows[:2])),
