@@ -49,7 +49,7 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
 # Units stand in brackets, or behind a stroke, or are the last word. Words end at a capital, too, as in TestTime; a word of a
 # sentence, with a mark at its end, is no name.
 _UNIT = re.compile(r"[(\[](?P<bracket>[^()\[\]]*)[)\]]|/(?P<stroke>[^/]*)$")
-_GAP = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~{}()\[\]/]|[,:](?=.)|(?<=[_\s])in(?=[_\s]))+")
+_GAP = re.compile(r"(?<=[a-zäöü]{2})(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~{}()\[\]/]|[,:](?=.)|(?<=[_\s])in(?=[_\s]))+")
 # A unit of text such as 1:02:03.5, which becomes seconds when it is read, by its letters.
 _CLOCK = re.compile(r"(?:hours?in)?h+m+(?:in)?s+[msfxz]*$")
 # What testers call the steps in which a cell is discharged, and those of other words in which it is charged.

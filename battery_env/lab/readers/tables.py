@@ -257,6 +257,8 @@ def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: Fil
 
 def _fields(line: str, delimiter: str) -> list[str]:
     line = line.lstrip("# ")  # numpy writes a header as a comment
+    if delimiter == _BLANKS and any(other in line for other in _DELIMITERS):
+        return []
     try:
         fields = line.split() if delimiter == _BLANKS else next(csv.reader([line], delimiter=delimiter), [])
     except csv.Error:
