@@ -32,7 +32,7 @@ _TIMES = _units(
 )
 _VOLTS = _units({"v volt volts": 1.0, "mv mvolt mvolts": 1e-3})
 _CHARGES = _units({"mah": 3.6, "ah ahr amphr": 3600.0})
-_DEGREES = _units({"c degc celsius": 1.0}) | dict.fromkeys(("k", "kelvin"), (1.0, -ZERO_CELSIUS_K))
+_DEGREES = dict(_units({"c degc celsius": 1.0}), k=(1.0, -ZERO_CELSIUS_K), kelvin=(1.0, -ZERO_CELSIUS_K))
 # By quantity and unit in small letters alone: factor and offset to s, V, A, degC, W and C.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "time": _TIMES,
@@ -145,7 +145,7 @@ def recognise(
     labels = _labels(names, rows, {name.strip() for name in file_format.ignore})
     keys = {key for label in labels for key, _ in _parted(label)}
     marked = [each for each in TESTERS if keys & set(map(_key, each.told_by))]
-    tester = file_format.tester or joined(*marked[:1], TESTERS[-1])
+    tester = file_format.tester or (joined(marked[0], TESTERS[-1]) if marked else TESTERS[-1])
     chosen, units = file_format.columns or {}, {**tester.units, **(file_format.units or {})}
     _check_stated(chosen, units, names)
     found, doubts = dict[str, Column](), list[str]()
@@ -162,7 +162,8 @@ def recognise(
         for place in places[:1]:
             unit = _unit(units.get(quantity, ""), quantity) or _unit_in(labels[place], quantity)
             if unit or quantity not in _WITH_UNIT:
-                found[quantity] = Column(place, names[place], unit, *_UNITS.get(quantity, {}).get(unit, (1.0, 0.0)))
+                factor, offset = _UNITS.get(quantity, {}).get(unit, (1.0, 0.0))
+                found[quantity] = Column(place, names[place], unit, factor, offset)
         if len(places) > 1 and quantity in REQUIRED:
             both = " and ".join(repr(names[place]) for place in places)
             doubts.append(f"both {both} may be the {quantity}: --columns {quantity}=NAME, or --ignore NAME (Python: ignore)")
