@@ -14,19 +14,16 @@ from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES, AgingPath
-from battery_env.electrochemistry.ends import LONGEST_S
 from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_errors, memory_share
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.evidence import dropouts_s, evidence_of, measured, unseen_C
-from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
-from battery_env.estimators.reasons import SETTLED_SHARES, Reason
+from battery_env.estimators.reasons import Reason
 from battery_env.estimators.search import MARGIN, Fit, JointPrior, Prior, Search, square
 from battery_env.estimators.verdict import (
-    MISMATCH_MARGIN,
     MOST_NOISE_SD,
     PRIOR_LIMIT_SD,
     SPARE_SAMPLES,
@@ -96,7 +93,7 @@ class LeastSquares(Estimator):
 
     *Settled* means that the record alone determines every parameter searched for, with a standard deviation below
     :data:`~battery_env.estimators.reasons.SETTLED_SHARES` of its value without any prior, and that nothing contradicts it:
-    the start, gaps and steps of the voltage, its fit, its end, bounds, and a prior. Otherwise ``reason`` of the estimate says
+    the start, gaps and steps of the voltage, its fit, bounds, and a prior. Otherwise ``reason`` of the estimate says
     which of these does not hold, the largest doubt first, and ``settled_q_mobile`` or ``settled_r_o`` whether one of the
     numbers is settled all the same. An estimate that rests on a prior is not settled: it is as good as the prior.
 
@@ -326,7 +323,6 @@ class LeastSquares(Estimator):
         diagnosis.note(Reason.MISFIT, square(fit.residual_V) > n * misfit_limit_V2(noise_V, n, drift_V, is_stated))
         q_mobile = fit.values["q_mobile"]
         diagnosis.note(Reason.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, self.model.cell.q_mobile))
-        _note_end(diagnosis, record, fitted, max(MISMATCH_MARGIN * drift_V, MOST_NOISE_SD * noise_V, RESOLUTION_V))
         if self.path is not None:
             ratio = self.path.distance_sd(fit.values) / BESIDE_LIMIT_SD
             diagnosis.note(Reason.OTHER_KIND, ratio > 1.0, what="distance from the path of aging cells", ratio=ratio)
@@ -338,25 +334,6 @@ class LeastSquares(Estimator):
         known = Assumptions(self.current_gain_sd, sd_soc / soc, is_along_path=self.path is not None)
         own_sds = fitted.sd(alone, {"q_mobile": self._sd_ratio})
         return diagnosis.verdict(alone.values, own_sds, free, priors, known)
-
-
-def _note_end(diagnosis: Diagnosis, record: Samples, fitted: _Fitted, deviation_V: float) -> None:
-    """Note where the model comes as low as the record did much earlier or later than the record."""
-    values, (time_s, voltage_V, current_A) = fitted.fit.values, record
-    n = int(voltage_V.argmin())
-    load_A = float(current_A[max(n - 1, 0) : n + 1].max())
-    # at rest, with whatever current a sensor shows then, no voltage is reached
-    if n == 0 or load_A * LONGEST_S <= values["q_mobile"]:
-        return
-    estimate, model = Estimate(values["q_mobile"], values["r_o"]), fitted.search.model_at(values)
-    until, lowest_V = record.first(n + 1), float(voltage_V[n]) - values.get("offset_V", 0.0)
-    forecast = model.forecast(until, estimate, lowest_V, load_A)
-    early_s, late_s = (forecast.reached_s(lowest_V + sign * deviation_V) for sign in (1.0, -1.0))
-    # the end of a record agrees with an estimate as nearly as a q_mobile that is settled
-    allowed_s = SETTLED_SHARES["q_mobile"] * (time_s[n] - time_s[0]) + 2.0 * model.dt_s
-    agrees = early_s - allowed_s <= time_s[n] <= late_s + allowed_s
-    model_s = early_s if early_s > time_s[n] else late_s
-    diagnosis.note(Reason.OTHER_END, not agrees, lowest_V=voltage_V[n], end_s=time_s[n], model_end_s=model_s)
 
 
 def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) -> dict[str, float]:

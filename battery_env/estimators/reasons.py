@@ -149,7 +149,6 @@ class Reason(_Row):
         "--cell), state a larger mismatch_V (a policy takes none), or check the sensors, the prior if one was given, and that "
         "this is one discharge."
     )
-    OTHER_END = "The record falls to {lowest_V:.2f} V at {end_s:.0f} s, where this estimate says {model_end_s:.0f} s."
     PRIOR_WRONG = "The prior of {name} contradicts what the record says."
     # what the record does not tell of one number
     IN_DOUBT = "{in_doubt:{form}} {unit} are in doubt: {doubt}"

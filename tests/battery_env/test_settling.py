@@ -114,9 +114,7 @@ VERDICTS = {
         {"parameters": ["q_mobile"], "cell": NEW_CELL.replace(r_o=0.12), "mismatch_V": 0.0, "voltage_noise_V": 0.005}, MISFIT,
     ),
     "misfit by a prior": (BOTH[1:], REAL.loaded_part(2.7), {"prior_q_mobile_C": (8000.0, 80.0)}, MISFIT),
-    "prior of another end": (
-        BOTH[:1], WHOLE, {"prior_q_mobile_C": (8000.0, 80.0)}, "The record falls to 2.80 V at 2820 s, where this estimate says"
-    ),
+    "prior of another end": (BOTH[:1], WHOLE, {"prior_q_mobile_C": (8000.0, 80.0)}, "The prior of q_max contradicts"),
     "wrong prior of q_mobile": (BOTH[:1], WHOLE, {"prior_q_mobile_C": (5400.0, 20.0)}, "The prior of q_max contradicts"),
     "wrong prior, filter": (BOTH[1:], WHOLE, {"prior_q_mobile_C": (5700.0, 60.0)}, "The prior of q_max contradicts"),
     "wrong prior of r_o": (BOTH[1:], WHOLE, {"prior_r_o_ohm": (0.25, 0.02)}, "The prior of R_o contradicts"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import expm1, isnan
 
 from battery_env.compiled import compiled
-from battery_env.estimators.diagnosis.faults import NOISES, SMOOTHED_SHARE, Row, middle, noise_V, table
+from battery_env.estimators.diagnosis.faults import Row, middle, noise_V, table
 from battery_env.records import REST_CURRENT_A, STEADY_S, SWITCH_SHARE
 
 # An interval between two samples is a gap where it is so many times longer than the one before, and what its load draws in
@@ -14,13 +14,11 @@ from battery_env.records import REST_CURRENT_A, STEADY_S, SWITCH_SHARE
 _RATIO, _LEAST_SHARE, _HABIT = 2.5, 0.005, 3
 # Where the charge of a gap was drawn, cell and model part across it by less than this share of the fall of the model.
 _MOST_SHARE = 0.5
-# With so many standard deviations to spare it was.
-_SURE_SD = 1.5
 # What model and cell part by is averaged over about so many samples before a gap, twice, which tells its trend, and how fast
 # the voltage falls over so long, s; after it the middle voltage of three counts.
 _PARTED_MEMORY, _RATE_MEMORY_S, _PARTED_SAMPLES = 4.0, 100.0, 3
-# Standard deviation of the difference of both, as a share of the noise.
-_PARTED_NOISE_SHARE = 0.84
+# With so much of what is no more than noise to spare: one and a half standard deviations of the difference.
+_MARGIN_SHARE = 0.25
 
 #: What was expected before a gap: the last interval, the voltage, by how much cell and model part and how fast the voltage
 #: falls, both in the mean; the longest intervals under load that were not in doubt, in their order.
@@ -123,9 +121,8 @@ def _close(evidence: Row, voltage: float, load_A: float) -> None:
     # jumped, does not.
     gap = evidence.gap
     missing_V = middle(gap.after_V, gap.next_V, voltage) - gap.model_V
-    sd_V, most_V = _PARTED_NOISE_SHARE * noise_V(evidence) / (NOISES * SMOOTHED_SHARE), _MOST_SHARE * gap.fall_V
     gap.samples = 0.0
-    if gap.fall_V > 0.0 and missing_V + _SURE_SD * sd_V < most_V:
+    if gap.fall_V > 0.0 and missing_V + _MARGIN_SHARE * noise_V(evidence) < _MOST_SHARE * gap.fall_V:
         _note_interval(evidence, gap.length_s, load_A)
         return
     _doubt(gap)
