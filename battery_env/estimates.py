@@ -96,14 +96,16 @@ class EstimateTrace:
     reason: StringArray | None = None
     settled_q_mobile: BoolArray | None = None
     settled_r_o: BoolArray | None = None
-    constants: Sequence[Mapping[str, float]] | None = None
+    constants: Sequence[Mapping[str, float] | None] | None = None
 
     @classmethod
     def of(cls, time_s: Sequence[float] | FloatArray, estimates: Sequence[Estimate]) -> EstimateTrace:
         """A trace of single estimates, and the time of the last sample that each has seen, s."""
         names = (*_COLUMNS, "settled")
         columns: dict[str, Any] = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
-        return cls(np.array(time_s), **columns, reason=np.array([estimate.reason for estimate in estimates], dtype=object))
+        constants = None if estimates[-1].constants is None else [estimate.constants for estimate in estimates]
+        reasons = np.array([estimate.reason for estimate in estimates], dtype=object)
+        return cls(np.array(time_s), **columns, reason=reasons, constants=constants)
 
 
 def last_estimate(trace: EstimateTrace) -> Estimate:

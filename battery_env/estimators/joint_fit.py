@@ -28,6 +28,7 @@ from battery_env.estimators.cell_fit import (
     groups,
     unseen_of_life,
 )
+from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, BELOW_REST_V
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, spread_over, square
@@ -54,7 +55,7 @@ _MOST_DISCHARGES, _FEWEST_SAMPLES = 30, 20
 _MOST_SAMPLES = 2000
 # Rounds of weighing the residuals by how large they turn out, and how large they are taken for in the first one, V.
 _ROUNDS = 3
-_FIRST_MISMATCH_V, LEAST_MISMATCH_V = 0.02, 1e-3
+_FIRST_MISMATCH_V = 0.02
 #: Each discharge shows so many independent errors of the model, unless its residuals change their sign more often.
 INDEPENDENT_ERRORS = independent_errors(1.0, MORE_ERRORS["fit"])
 # The search: how many standard deviations of its prior a constant may move, the logarithm of the distance of q_mobile to its
@@ -334,7 +335,7 @@ class JointFit:
         left = np.diag(self._covariance(x, weights))[: len(self.sd)]
         fitted = float(np.sum(1.0 - left)) + 2.0 * len(residuals_V)
         square_V2 = sum(count * _rms(residual) ** 2 for count, residual in zip(independent, residuals_V, strict=True))
-        return _Weights(max(float(np.sqrt(square_V2 / (independent.sum() - fitted))), LEAST_MISMATCH_V), independent)
+        return _Weights(max(float(np.sqrt(square_V2 / (independent.sum() - fitted))), RESOLUTION_V), independent)
 
     def _left_out_V(self, x: FloatArray, weights: _Weights) -> list[float | None]:
         """

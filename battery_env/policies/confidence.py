@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import hypot
+from math import hypot, isnan, nan
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from battery_env.estimators.verdict import (
     SPARE_SAMPLES,
     Assumptions,
     Diagnosis,
-    Verdict,
     misfit_limit_V2,
     white_noise_V,
 )
@@ -33,8 +32,6 @@ from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES, VoltageTask
 
 # Residuals below this may be what a linear step leaves, V
 _LINEAR_STEP_V = 2e-3
-# An offset may be this many times the bound that it was trained with
-_OFFSET_MARGIN = 2.0
 
 
 class Confidence:
@@ -53,10 +50,6 @@ class Confidence:
         self._sd_ratio = 1.0 if task.path is None else task.path.sd_ratio
         self._cell, self._dt_s = cell, dt_s
 
-    def constants(self, fitted: Fitted, n: int) -> dict[str, float] | None:
-        """What the fit says of the constants along a path, by their names."""
-        return None if self._path is None else _by_name(fitted, n)
-
     def _model_V(self, fitted: Fitted, n: int, record: Samples) -> FloatArray:
         """The voltage of the model that was fitted, at the samples of a record."""
         cell = cell_with(self._cell, _by_name(fitted, n))
@@ -64,13 +57,11 @@ class Confidence:
         q_mobile, r_o = np.clip(fitted.estimate[n], *np.array([ESTIMATE_RANGES[name] for name in PARAMETER_NAMES]).T).tolist()
         return RecordModel(cell, dt_s=self._dt_s).voltage(record, Estimate(q_mobile, r_o)) + fitted.offset_V[n]
 
-    def verdict(
-        self, fitted: Fitted, n: int, estimate: FloatArray, record: Samples, history: ChargeHistory
-    ) -> tuple[Verdict, FloatArray]:
+    def estimate(self, fitted: Fitted, n: int, estimate: FloatArray, record: Samples, history: ChargeHistory) -> Estimate:
         """
-        Which numbers of an estimate are settled, and why not both; and its standard deviations, those of the fit with the
-        distance of the estimate from it and the charge that nobody saw, shape (2,). What is known of the parameters before
-        settles nothing.
+        An estimate, with its standard deviations, those of the fit with the distance of the estimate from it and the charge
+        that nobody saw; which of both numbers are settled, and why not both; and along a path what the fit says of the
+        constants. What is known of the parameters before settles nothing.
         """
         cell, (q_mobile, r_o), path = self._cell, estimate.tolist(), self._path
         model_V = self._model_V(fitted, n, record)
@@ -93,7 +84,7 @@ class Confidence:
         most_sd = REACH_SD if path is None else BESIDE_LIMIT_SD
         for what, size, most in (
             ("distance from the constants that it has learned of", float(fitted.constants_sd[n]), most_sd),
-            ("offset of the voltage", abs(float(fitted.offset_V[n])), _OFFSET_MARGIN * self._offset_V),
+            ("offset of the voltage", abs(float(fitted.offset_V[n])), MISMATCH_MARGIN * self._offset_V),
         ):
             if size > (1.0 - ROUNDING) * most:  # as a fit keeps within its reach
                 diagnosis.note(Reason.OTHER_KIND, what=what, ratio=size / most)
@@ -103,8 +94,11 @@ class Confidence:
         values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
         known = Assumptions(apart=(float(apart[0]), float(apart[1])), is_along_path=path is not None)
         verdict = diagnosis.verdict(values, sds, self._parameters, known=known)
-        held = [name not in self._parameters for name in PARAMETER_NAMES]
-        return verdict, np.where(held, np.nan, np.hypot(self._sd_ratio * fitted.sd[n], hidden))
+        stated = dict(zip(PARAMETER_NAMES, np.hypot(self._sd_ratio * fitted.sd[n], hidden).tolist(), strict=True))
+        # the same NaN always, so that equal estimates are equal
+        sd_q_mobile, sd_r_o = (nan if name not in self._parameters or isnan(sd) else sd for name, sd in stated.items())
+        constants = None if path is None else _by_name(fitted, n)
+        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **verdict._asdict(), constants=constants)
 
 
 def _by_name(fitted: Fitted, n: int) -> dict[str, float]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from importlib import import_module
-from math import isnan, nan
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -20,7 +19,6 @@ from battery_env.electrochemistry.ends import SURPLUS_SHARE
 from battery_env.estimates import last_estimate
 from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
 from battery_env.estimators.reasons import Reason
-from battery_env.estimators.verdict import Verdict
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
 from battery_env.policies.stream import columns, on_grid, with_voltage
@@ -41,8 +39,12 @@ from battery_env.tasks.voltage.voltage_task import VoltageTask
 
 # Steps in which a stream is followed, s
 _STEP_S = 1.0
-# Of a policy without a fit, before its first decision, and of one that is not judged.
-_NOTHING_STATED = Verdict(False, False, Reason.NOTHING_STATED.text)
+
+
+def _unstated(values: FloatArray) -> Estimate:
+    """Of a policy without a fit, before its first decision, and of one that is not judged."""
+    q_mobile, r_o = values.tolist()
+    return Estimate(q_mobile, r_o, settled=False, reason=Reason.NOTHING_STATED.text)
 
 
 class Predictor(Protocol):
@@ -158,14 +160,10 @@ class PolicyEstimator(OnlineEstimator):
 
     def _judge(self) -> None:
         """Tell how sure the estimate is, of the samples up to the last decision."""
-        self._sd, self._found = [nan, nan], None
-        self._verdict = _NOTHING_STATED
+        self._estimate = _unstated(self._now)
         if self._confidence is not None and self._fitted is not None:
             samples = with_voltage(self._samples, self._decisions * self.decision_s)
-            self._verdict, sd = self._confidence.verdict(self._fitted, 0, self._now, samples, ChargeHistory())
-            self._found = self._confidence.constants(self._fitted, 0)
-            # the same NaN always, so that equal estimates are equal
-            self._sd = [nan if isnan(each) else each for each in sd.tolist()]
+            self._estimate = self._confidence.estimate(self._fitted, 0, self._now, samples, ChargeHistory())
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
@@ -194,8 +192,7 @@ class PolicyEstimator(OnlineEstimator):
         self.check(voltage_V, current_A, dt_s, temperature_C)
         time_s = self._samples[-1][0] + dt_s if self._samples else 0.0
         self._take(time_s, float(voltage_V), float(current_A))
-        (q_mobile, r_o), (sd_q_mobile, sd_r_o) = self._now.tolist(), self._sd
-        return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **self._verdict._asdict(), constants=self._found)
+        return self._estimate
 
     def _take(self, time_s: float, voltage_V: float, current_A: float) -> None:
         if self._samples:
@@ -226,7 +223,7 @@ class PolicyEstimator(OnlineEstimator):
 
     def now(self) -> ModelNow:
         """The model at the last sample, with the estimate as its parameters."""
-        model = RecordModel(cell_with(self.cell, self._found), dt_s=self.dt_s)
+        model = RecordModel(cell_with(self.cell, self._estimate.constants), dt_s=self.dt_s)
         q_mobile, r_o = self._now.tolist()
         state = model.start(q_mobile)
         if self._samples and self._samples[-1][0] > 0.0:
@@ -264,8 +261,7 @@ class PolicyEstimator(OnlineEstimator):
         if trace.sd_q_mobile is not None:
             return last_estimate(trace)
         first = 0 if self.task_class.is_averaged else -1
-        q_mobile, r_o = (float(values[first:].mean()) for values in (trace.q_mobile, trace.r_o))
-        return Estimate(q_mobile, r_o, settled=False, reason=_NOTHING_STATED.reason)
+        return _unstated(np.array([trace.q_mobile[first:].mean(), trace.r_o[first:].mean()]))
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """The estimates over time of many discharges, run as one batch, in their order."""
@@ -276,38 +272,26 @@ class PolicyEstimator(OnlineEstimator):
         task = self._follow(records, self.decision_s)
         samples = [] if self._confidence is None else [(Samples.of(record), history_of(record)) for record in records]
         made: list[FloatArray] = []
-        verdicts: list[Verdict] = []
-        found: list[dict[str, float] | None] = []
+        judged: list[Estimate] = []
         while (running := ~task.truncated()).any():
             (discharge, time_s, known), fitted = task.seen(), task.fitted()
             action, _ = self.policy.predict(task.observation(), deterministic=True)
             task.advance(np.asarray(action))
             estimate = task.estimate
-            columns = [discharge[:, None], time_s[:, None], estimate]
             if self._confidence is not None and fitted is not None:
-                sd = np.full_like(estimate, nan)
-                columns.append(sd)
-                is_open = judge_last_only & ~task.truncated()
+                is_left = judge_last_only & ~task.truncated()
                 for n in np.flatnonzero(running).tolist():
-                    if is_open[n]:
-                        verdicts.append(_NOTHING_STATED)
-                        found.append(None)
-                        continue
                     record, history = samples[discharge[n]]
-                    verdict, sd[n] = self._confidence.verdict(fitted, n, estimate[n], record.first(int(known[n])), history)
-                    verdicts.append(verdict)
-                    found.append(self._confidence.constants(fitted, n))
-            made.append(np.concatenate(columns, axis=1)[running])
+                    seen = record.first(int(known[n]))
+                    sure = _unstated(estimate[n])
+                    if not is_left[n]:
+                        sure = self._confidence.estimate(fitted, n, estimate[n], seen, history)
+                    judged.append(sure)
+            made.append(np.column_stack([discharge, time_s, estimate])[running])
             task.drop_ended()
         rows = np.concatenate(made)
         in_order = np.argsort(rows[:, 0], kind="stable")
         of_each = np.split(in_order, np.searchsorted(rows[in_order, 0], np.arange(1, len(records))))
         if self._confidence is None:
             return [EstimateTrace(rows[n, 1], rows[n, 2], rows[n, 3]) for n in of_each]
-        settled_q, settled_r_o = np.array([each[:2] for each in verdicts]).T
-        texts = np.array([each.reason for each in verdicts], dtype=object)
-        said = (settled_q & settled_r_o, texts, settled_q, settled_r_o)
-        traces = [EstimateTrace(*rows[n, 1:4].T, *rows[n, 4:6].T, *(column[n] for column in said)) for n in of_each]
-        if found[-1] is None:
-            return traces
-        return [replace(trace, constants=[found[k] for k in n]) for trace, n in zip(traces, of_each, strict=True)]
+        return [EstimateTrace.of(rows[n, 1], [judged[k] for k in n]) for n in of_each]

@@ -53,9 +53,8 @@ GATE_SD, LIMIT_SD = 5.0, 5.0
 # The last innovations, and the products of each one with those before it, are averaged with these weights of what was.
 _TREND_MEMORY, _PRODUCTS_MEMORY = 0.8, 0.999
 # A filter is linear over its standard deviation of q_mobile: a wider prior is divided among filters this far apart (as a
-# share of its mean), over so many standard deviations to each side.
+# share of its mean), to each side as far as it would not contradict the record.
 _WIDEST_SHARE = 0.08
-_REACH_SD = 2.5
 # Larger cells are rare, not impossible: their filters lie one width of the prior apart, as a share, and their weights fall
 # with this power of the size.
 _RARITY_OF_SIZE = 3.0
@@ -78,12 +77,13 @@ def filters_of_prior(
 ) -> NDArray[np.void]:
     """The filters that a prior takes, before the first sample of a cell at rest."""
     (q, r_o), share = means, sds[Q] / means[Q]
-    half = int(np.ceil(_REACH_SD * share / _WIDEST_SHARE)) if share > _WIDEST_SHARE else 0
-    deviations = np.linspace(-_REACH_SD, _REACH_SD, 2 * half + 1) if half else np.zeros(1)
-    q_mobile, sd_q = q * (1.0 + share * deviations), np.full(len(deviations), _REACH_SD / half * sds[Q] if half else sds[Q])
+    half = int(np.ceil(PRIOR_LIMIT_SD * share / _WIDEST_SHARE)) if share > _WIDEST_SHARE else 0
+    deviations = np.linspace(-PRIOR_LIMIT_SD, PRIOR_LIMIT_SD, 2 * half + 1) if half else np.zeros(1)
+    q_mobile = q * (1.0 + share * deviations)
+    sd_q = np.full(len(deviations), PRIOR_LIMIT_SD / half * sds[Q] if half else sds[Q])
     size, log_weight = np.ones(len(deviations)), -0.5 * deviations**2
     if half and not is_size_known:
-        log_size = np.arange(np.log1p(_REACH_SD * share), -_LEAST_LOG_WEIGHT / _RARITY_OF_SIZE, share)
+        log_size = np.arange(np.log1p(PRIOR_LIMIT_SD * share), -_LEAST_LOG_WEIGHT / _RARITY_OF_SIZE, share)
         larger = np.exp(log_size)
         q_mobile, sd_q = np.append(q_mobile, q * larger), np.append(sd_q, sds[Q] * larger)
         size, log_weight = np.append(size, larger), np.append(log_weight, -_RARITY_OF_SIZE * log_size)

@@ -80,16 +80,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
     as far as the cell has room for it: the model charges by the same equations. A measured temperature is that of the model
     then; the first one is also that of its surroundings.
 
-    *Settled* means that the data determine every parameter searched for: its standard deviation, without what a given prior
-    adds to it, is below :data:`~battery_env.estimators.reasons.SETTLED_SHARES` of its value; and that nothing
-    contradicts it: not the start of the record, the voltage where the load is switched, steady or not logged, a bound, the
-    kind of cell, the prior, nor the innovations, which may not go the same way again and again, with twice ``mismatch_V``
-    allowed for.
-    Otherwise ``reason`` of the estimate says which of these does not hold: of each number the first one in the order of
-    :class:`~battery_env.estimators.diagnosis.Reason`, and first that of the number that is farther beyond its limit. Of
-    a number that the data determine, while they do not determine the other one, ``settled_q_mobile`` or ``settled_r_o`` says
-    so. An estimate that rests on a prior is not settled: it is as good as
-    the prior.
+    *Settled* is what :class:`~battery_env.estimators.LeastSquares` calls it. In place of the fit it is judged whether the
+    innovations go the same way again and again, with twice ``mismatch_V`` allowed for.
 
     The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
     ``battery_env.Settings(method="kalman").calibrator()``: a model of the temperature, and the errors of model and sensor to

@@ -64,8 +64,8 @@ REACH_SD = 3.0
 _LONGEST_STEP = 0.1
 # What is known of an unknown about which nothing is known, in its unit to the power of -2
 _NOTHING = 1e-6
-# What the parts of an observation are divided by; standard deviations by this share of the range of the estimate
-_VOLTAGE_SCALE_V = 0.010
+#: What the parts of an observation are divided by; standard deviations by this share of the range of the estimate
+VOLTAGE_SCALE_V = 0.010
 _SD_SCALE = 0.01
 # Noise is not taken for less, V.
 _LEAST_NOISE_V = 0.001
@@ -213,8 +213,8 @@ class NuisanceFit:
         return [
             np.clip(np.sign(step) * np.sqrt(np.abs(step) / largest_step), -1.0, 1.0),
             np.log(sd / (_SD_SCALE * width)),
-            np.log(self._found[:, 2 * n, None] / _VOLTAGE_SCALE_V),
-            np.arcsinh(self._found[:, _OFFSET, None] / _VOLTAGE_SCALE_V),
+            np.log(self._found[:, 2 * n, None] / VOLTAGE_SCALE_V),
+            np.arcsinh(self._found[:, _OFFSET, None] / VOLTAGE_SCALE_V),
             (self.constants - self._first) / self.prior.shown,
         ]
 

@@ -34,9 +34,8 @@ from battery_env.electrochemistry.cell import (
 from battery_env.electrochemistry.kernels import BLOCK, equilibrium_voltage, mole_fraction, nominal_overpotentials
 from battery_env.records import Record, check_record, resample_current
 
-# Far more charge and exactly as much resistance as it takes to read the linear part of the model off one simulation
+# Far more charge than it takes to read the linear part of the model off one simulation
 _PLENTY_C = 1e6
-_ONE_OHM = 1.0
 # Share of q_mobile in the surface of each electrode at full charge
 _SURFACE_SHARE_N, _SURFACE_SHARE_P = (float(FULL_CHARGE_SHARES[column - QNB]) for column in (QNS, QPS))
 #: Step of the difference quotient dV/dq, as a share of q.
@@ -233,7 +232,7 @@ def _linear_part(
     state = simulate(
         np.append(current_A, 0.0),
         _PLENTY_C,
-        _ONE_OHM,
+        1.0,  # ohm, so that the ohmic drop is the current that it follows
         dt=dt_s,
         load_unit="current",
         cell=cell,
@@ -247,7 +246,7 @@ def _linear_part(
         )
     state = state[steps]
     moved_C = start[QNS] - state[:, QNS]
-    return moved_C + start[QNB] - state[:, QNB], moved_C, state[:, VO] / _ONE_OHM
+    return moved_C + start[QNB] - state[:, QNB], moved_C, state[:, VO]
 
 
 class Overpotentials(NamedTuple):

@@ -20,7 +20,7 @@ from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
 from battery_env.tasks.data import LoadKind, Split, opened, standard_dataset
-from battery_env.tasks.voltage.fit import FitPrior, Fitted, NuisanceFit
+from battery_env.tasks.voltage.fit import VOLTAGE_SCALE_V, FitPrior, Fitted, NuisanceFit
 from battery_env.tasks.voltage.readings import CURRENT, MEASURED, OHMIC, SENSOR_ROWS, Readings, explain
 from battery_env.trajectories import TrajectoryDataset
 
@@ -47,7 +47,6 @@ _STATE_COST_SCALE = 0.01
 _MISFIT_FLOOR_V = 0.001
 _SLOPE_SCALE_V_PER_C = 5e-5
 _CURRENT_SCALE_A = 3.0
-_MISFIT_SCALE_V = 0.010
 _TIME_SCALE_S = 3000.0
 
 
@@ -377,8 +376,8 @@ class VoltageTask(CalibrationTask):
             (unexplained_V / (self._misfit_V + _MISFIT_FLOOR_V)[:, None, None]).reshape(self.cells, -1),
             np.arcsinh(slope_V_per_C / _SLOPE_SCALE_V_PER_C).reshape(self.cells, -1),
             (ohmic_A / _CURRENT_SCALE_A).reshape(self.cells, -1),
-            np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * _MISFIT_FLOOR_V) / _MISFIT_SCALE_V),
-            np.arcsinh(residual_V.mean(axis=(1, 2)) / _MISFIT_SCALE_V)[:, None],
+            np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * _MISFIT_FLOOR_V) / VOLTAGE_SCALE_V),
+            np.arcsinh(residual_V.mean(axis=(1, 2)) / VOLTAGE_SCALE_V)[:, None],
             (self._time_s / _TIME_SCALE_S)[:, None],
             self._scaled(self._estimate),
             *([] if self._fit is None else self._fit.parts(self._step, self._high - self._low)),
