@@ -346,21 +346,6 @@ def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter)
     assert read(pd.DataFrame(columns)).charge_C == pytest.approx(charge_C[-1], rel=0.02)
 
 
-@pytest.mark.parametrize("pulse_s", [5, 40, 55])
-def test_pulses_within_a_charge_are_no_discharges(pulse_s):
-    # 360 C and a pulse twelve times, and then the whole discharge
-    minute_s = np.mod(np.arange(0.0, 3600.0, 5.0), 300.0)
-    current_A = np.where(minute_s < 240.0, 1.5, np.where(minute_s < 240.0 + pulse_s, -1.5, 0.0))
-    voltage_V = 3.6 + 0.6 * np.cumsum(current_A) / np.cumsum(current_A).max() + 0.05 * current_A
-    pulses = pd.DataFrame({"time": np.arange(0.0, 3600.0, 5.0), "voltage": voltage_V, "current": current_A})
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        discharges = read_discharges(pd.concat([pulses, REST, CYCLE[len(CHARGE) + len(REST) :]], ignore_index=True))
-    assert any("left aside" in str(each.message) for each in caught) == (pulse_s > 5)
-    near(discharges[0], 0.03)
-    assert len(discharges) == 1
-
-
 def test_what_is_left_aside_is_named_and_a_mistake_in_some_cycles_loses_no_other():
     cycle = CYCLE.assign(Cycle=1, current=10.0 * CYCLE["current"])
     small = cycle.assign(current=0.005 * cycle["current"], time=cycle["time"] + 9000.0, Cycle=2)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from unicodedata import normalize
 
 from battery_env.checks import ZERO_CELSIUS_K
-from battery_env.lab.readers.testers import INSTEAD, QUANTITIES, REQUIRED, TESTERS, Tester, joined
+from battery_env.lab.readers.testers import INSTEAD, LONGEST, QUANTITIES, REQUIRED, TESTERS, Tester, joined, words_of
 
 # Quantities that only a name with a unit is: p and q may be anything.
 _WITH_UNIT = ("counter", "power", "charge_step", "capacity")
@@ -46,17 +46,13 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "ambient": _DEGREES,
     "capacity": _CHARGES,
 }
-# Units stand in brackets, or behind a stroke, or are the last word. Words end at a capital, too, as in TestTime; a word of a
-# sentence, with a mark at its end, is no name.
+# Units stand in brackets, or behind a stroke, or are the last word.
 _UNIT = re.compile(r"[(\[](?P<bracket>[^()\[\]]*)[)\]]|/(?P<stroke>[^/]*)$")
-_GAP = re.compile(r"(?<=[a-zäöü]{2})(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~{}()\[\]/]|[,:](?=.)|(?<=[_\s])in(?=[_\s]))+")
 # A unit of text such as 1:02:03.5, which becomes seconds when it is read, by its letters.
 _CLOCK = re.compile(r"(?:hours?in)?h+m+(?:in)?s+[msfxz]*$")
 # What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
 _DISCHARGE = re.compile(r"\bd\b|\bdis\b|dch|dsg|disch|entlad|放电")
 _CHARGE = re.compile(r"\bc\b|ch|lad|充电")
-# So long are names, and what is shown of a line.
-_LONGEST = 200
 
 
 class Column(NamedTuple):
@@ -108,7 +104,7 @@ class Recognised(NamedTuple):
         told |= {"tester": self.tester.name}
         told |= {key: f"{each.name!r}{f' in {each.unit}' if each.unit else ''}" for key, each in self.columns.items()}
         told |= {each: "not found" for each in self.missing} | {"not used": ", ".join(self._unused())}
-        return [f"{key:<12}{text if len(text) <= _LONGEST else f'{text[:_LONGEST]} ...'}" for key, text in told.items()]
+        return [f"{key:<12}{text if len(text) <= LONGEST else f'{text[:LONGEST]} ...'}" for key, text in told.items()]
 
     def _unused(self) -> list[str]:
         used = {column.position for column in self.columns.values()}
@@ -144,21 +140,21 @@ def recognise(
     names = [str(name).strip() for name in names]
     labels = _labels(names, rows, {name.strip() for name in file_format.ignore})
     keys = {key for label in labels for key, _ in _parted(label)}
-    marked = [each for each in TESTERS if keys & set(map(_key, each.told_by))]
+    marked = [each for each in TESTERS if any("".join(words_of(name)) in keys for name in each.told_by)]
     tester = file_format.tester or (joined(marked[0], TESTERS[-1]) if marked else TESTERS[-1])
     chosen, units = file_format.columns or {}, {**tester.units, **(file_format.units or {})}
     _check_stated(chosen, units, names)
+    ranks = [_ranks(label, tester) for label in labels]
     found, doubts = dict[str, Column](), list[str]()
     for quantity in QUANTITIES:
         if quantity in INSTEAD["current"] and ("current" in found or file_format.load):
             continue
         # a column is one thing, but where the caller says otherwise
         used = {column.name for column in found.values()} | {name.strip() for name in chosen.values()}
+        free = {n: each[quantity] for n, each in enumerate(ranks) if quantity in each and names[n] not in used}
+        places = [n for n, rank in free.items() if rank == min(free.values())]
         if quantity in chosen:
             places = [names.index(chosen[quantity].strip())]
-        else:
-            free = ["" if name in used else label for name, label in zip(names, labels, strict=True)]
-            places = _places(free, quantity, tester)
         for place in places[:1]:
             unit = _unit(units.get(quantity, ""), quantity) or _unit_in(labels[place], quantity)
             if unit or quantity not in _WITH_UNIT:
@@ -193,34 +189,25 @@ def _labels(names: Sequence[str], rows: Sequence[Sequence[str]], ignore: Collect
     return [f"{name} ({unit})" if name and not _UNIT.search(name) else name for name, unit in zip(labels, below, strict=False)]
 
 
-def _places(labels: Sequence[str], quantity: str, tester: Tester) -> list[int]:
-    """The columns that may be a quantity, those of the first name that there is."""
-    ranks = _ranks(tuple(tester.columns.get(quantity, ())))
-    found = {n: rank for n, label in enumerate(labels) if (rank := _rank(label, quantity, ranks)) is not None}
-    return [n for n, rank in found.items() if rank == min(found.values())]
-
-
-@lru_cache(maxsize=1024)
-def _ranks(names: tuple[str, ...]) -> dict[str, int]:
-    return {_key(name): rank for rank, name in reversed([*enumerate(names)])}
-
-
-def _rank(label: str, quantity: str, ranks: Mapping[str, int]) -> int | None:
-    """The rank of a name among those of a quantity; nothing if it is none, or has a unit that is none of the quantity."""
+def _ranks(label: str, tester: Tester) -> dict[str, int]:
+    """The quantities that a name may be, by its unit too, and its rank among the names of each."""
+    found: dict[str, int] = {}
     for key, unit in _parted(label):
-        if key in ranks and (quantity not in _UNITS or not _letters(unit) or _unit(unit, quantity)):
-            return ranks[key]
-    return None
+        for quantity, rank in tester.ranks.get(key, {}).items():
+            if quantity not in _UNITS or not _letters(unit) or _unit(unit, quantity):
+                found.setdefault(quantity, rank)
+    return found
 
 
 @lru_cache(maxsize=4096)
 def _parted(name: str) -> tuple[tuple[str, str], ...]:
     """What a name may be, and its unit: the whole, what is in brackets or behind a stroke, the last word."""
-    name = normalize("NFKC", name)[:_LONGEST]  # brackets may be as wide as a Chinese character
-    words, match = _words(name), _UNIT.search(name)
+    name = normalize("NFKC", name)[:LONGEST]
+    words, match = words_of(name), _UNIT.search(name)
     found = [("".join(words), "")]
     if match:
-        found.append((_key(name[: match.start()] + name[match.end() :]), match["bracket"] or match["stroke"] or ""))
+        base = name[: match.start()] + name[match.end() :]
+        found.append(("".join(words_of(base)), match["bracket"] or match["stroke"] or ""))
     if len(words) > 1 and any(_unit(words[-1], quantity) for quantity in _UNITS):
         found.append(("".join(words[:-1]), words[-1]))
     return tuple(found)
@@ -230,14 +217,6 @@ def _unit_in(name: str, quantity: str) -> str:
     """The unit in a name, whatever the rest of it is: one that is the whole name, as mAmps, too."""
     (whole, _), *parted = _parted(name)
     return next((unit for text in (whole, *(unit for _, unit in parted)) if (unit := _unit(text, quantity))), "")
-
-
-def _words(name: str) -> list[str]:
-    return _GAP.sub(" ", name[:_LONGEST]).lower().split()
-
-
-def _key(name: str) -> str:
-    return "".join(_words(normalize("NFKC", name)))
 
 
 def _letters(text: str) -> str:
@@ -262,21 +241,15 @@ def are_units(fields: Sequence[str]) -> bool:
 
 def count_required(names: Iterable[str], file_format: FileFormat) -> int:
     """How much a line looks like the header of a record."""
-    labels = [name.strip() for name in names]
-    tester, chosen = file_format.tester or TESTERS[-1], file_format.columns or {}
-    return sum(
-        (
-            chosen[quantity].strip() in labels
-            if quantity in chosen
-            else any(_places(labels, each, tester) for each in (quantity, *INSTEAD.get(quantity, ())))
-        )
-        for quantity in REQUIRED
-    )
+    stated = {name.strip(): quantity for quantity, name in (file_format.columns or {}).items()}
+    found = {quantity for name in names for quantity in _ranks(name, file_format.tester or TESTERS[-1])}
+    found |= {stated[name.strip()] for name in names if name.strip() in stated}
+    return sum(bool(found & {quantity, *INSTEAD.get(quantity, ())}) for quantity in REQUIRED)
 
 
 def direction(state: object) -> int:
     """1 for what a tester calls a discharge, -1 for a charge, else 0."""
-    words = " ".join(_words(str(state)))
+    words = " ".join(words_of(str(state)))
     return 1 if _DISCHARGE.search(words) else -1 if _CHARGE.search(words) else 0
 
 

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
+# Words end at a capital, too, as in TestTime; a word of a sentence, with a mark at its end, is no name.
+_GAP = re.compile(r"(?<=[a-zäöü]{2})(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~{}()\[\]/]|[,:](?=.)|(?<=[_\s])in(?=[_\s]))+")
+#: So long are names, and what is shown of a line.
+LONGEST = 200
 #: What a column may hold, and what a record must have.
 QUANTITIES = tuple(
     "time date voltage counter current power charge_step temperature ambient capacity cycle step cell state".split()
@@ -46,6 +53,15 @@ class Tester:
     discharge_is_negative: bool | None = None
     encoding: str = ""
     missing: Sequence[str] = ()
+
+    @cached_property
+    def ranks(self) -> dict[str, dict[str, int]]:
+        """By the words of a name, the quantities that it may be, and its rank among their names."""
+        found: dict[str, dict[str, int]] = {}
+        for quantity, names in self.columns.items():
+            for rank, name in enumerate(names):
+                found.setdefault("".join(words_of(name)), {}).setdefault(quantity, rank)
+        return found
 
 
 def _row(name: str, told_by: str, negative: bool | None = None, encoding: str = "", missing: str = "", **names: str) -> Tester:
@@ -131,6 +147,11 @@ _PLAIN = _row(
     state="state, status, mode, step type, zustand, betriebsart, modus",
     cell="cell id, cell name, cell number, cell no, cell, battery id, barcode, serial number, channel, zelle",
 )  # fmt: skip
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a name in small letters; brackets may be as wide as a Chinese character."""
+    return _GAP.sub(" ", normalize("NFKC", name)[:LONGEST]).lower().split()
 
 
 def joined(first: Tester, *others: Tester) -> Tester:
