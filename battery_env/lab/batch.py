@@ -191,23 +191,20 @@ def _message(error: Exception) -> str:
     return text if isinstance(error, expected) and text else f"{type(error).__name__}: {text}"
 
 
-def _in_order(started: Iterable[tuple[_Call, Future[Attempt] | None]], ahead: int) -> Iterator[tuple[_Call, Attempt | None]]:
-    """
-    What became of calls, in the order in which they are started, each when at most so many others are under way. What needs no
-    call is passed on in its place.
-    """
-    waiting: deque[tuple[_Call, Future[Attempt] | None]] = deque()
+def _in_order(started: Iterable[tuple[_Call, Future[Attempt]]], ahead: int) -> Iterator[tuple[_Call, Attempt]]:
+    """What became of calls, in the order in which they are started, each when at most so many others are under way."""
+    waiting: deque[tuple[_Call, Future[Attempt]]] = deque()
 
-    def first() -> tuple[_Call, Attempt | None]:
+    def first() -> tuple[_Call, Attempt]:
         call, future = waiting.popleft()
         try:
-            return call, None if future is None else future.result()
+            return call, future.result()
         except Exception as error:  # the worker's
             return call, Attempt(None, [], _message(error))
 
     for each in started:
         waiting.append(each)
-        while waiting and (len(waiting) > ahead or (future := waiting[0][1]) is None or future.done()):
+        while waiting and (len(waiting) > ahead or waiting[0][1].done()):
             yield first()
     while waiting:
         yield first()
@@ -454,25 +451,24 @@ def calibrate_all(
     to_read = [source for source in sources if not (results and results.holds(source))]
     reads = ((source, executor.submit(attempt, read_source, source, file_format)) for source in to_read)
 
-    def calls() -> Iterator[tuple[_Place, Future[Attempt] | None]]:
+    def calls() -> Iterator[tuple[_Place, Future[Attempt]]]:
         for source, read in _in_order(reads, ahead):
             for place, recording in _places(source, read, used):
                 name = place.known.record
                 if recording is None:
-                    yield place, None
+                    yield place, InThisProcess().submit(Attempt, None, [], place.known.error)
                 elif not (results and results.holds(source, place.number)):
                     yield place, executor.submit(attempt, _calibrate, name, recording, settings, with_voltages)
 
     for place, made in _in_order(calls(), ahead):
-        outcome, whole = (place.known, False) if made is None else _outcome(place.known, made, results)
+        outcome, whole = (place.known, False) if place.known.error else _outcome(place.known, made, results)
         if results is not None:
             results.keep(outcome, place.source, place.number, place.of, whole)
         yield outcome
 
 
-def _places(source: Source, read: Attempt | None, used: set[str]) -> Iterator[tuple[_Place, Recording | None]]:
+def _places(source: Source, read: Attempt, used: set[str]) -> Iterator[tuple[_Place, Recording | None]]:
     """The discharges of a source, each with what was recorded; or the error of the source, without."""
-    assert read is not None
     if read.error:
         error = read.error if printable(source.path) in read.error else f"{source.path}: {read.error}"
         name = _unused(record_name(source.stem, source.cycle), used)

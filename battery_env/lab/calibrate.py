@@ -41,10 +41,6 @@ from battery_env.records import STEADY_S, ExpectedCurrent, Samples, drawn, expec
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
-# A record of more samples than this is averaged over the time step of the model, 1 s, or longer where it lasts longer than so
-# many steps: what lies between says nothing to the model.
-_MANY_SAMPLES = 100_000
-
 
 class Options(SettingsOptions, total=False):
     """Keywords of :func:`calibrate`: those of :class:`Settings`, and of :func:`battery_env.read_discharges`."""
@@ -183,9 +179,10 @@ def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
     """The part under load, how it starts, and what comes after it."""
     loaded, eod_time_s = discharge.loaded_part(settings.cut_off_V), discharge.eod_time_s(settings.cut_off_V)
     more_C = _charge_after(discharge, loaded, eod_time_s, settings.cut_off_V)
-    record = loaded
-    if len(loaded.time_s) > _MANY_SAMPLES:
-        record = loaded.averaged(max(1.0, float(loaded.time_s[-1] - loaded.time_s[0]) / _MANY_SAMPLES))
+    record, many = loaded, 100_000
+    if len(loaded.time_s) > many:
+        # what lies between two time steps of the model, of 1 s, says nothing to it
+        record = loaded.averaged(max(1.0, float(loaded.time_s[-1] - loaded.time_s[0]) / many))
     cell, fitted = _cell_at_the_temperature(record, settings), record
     if not settings.thermal:
         # one that is held counts more than one that was measured

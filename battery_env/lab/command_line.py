@@ -187,7 +187,7 @@ def _forecast_parser() -> argparse.ArgumentParser:
     )
     _add_calibration(parser.add_argument_group("calibration"))
     group = parser.add_argument_group("results")
-    group.add_argument("--out", type=Path, metavar="DIR", help="write a figure and a JSON file there; neither may exist")
+    group.add_argument("--out", type=Path, metavar="DIR", help="write a figure there, NAME_forecast.png; it may not exist")
     group.add_argument("--json", action="store_true", help="print one JSON object")
     return parser
 
@@ -434,21 +434,21 @@ def _fit(arguments: Sequence[str]) -> int:
 def _forecast(arguments: Sequence[str]) -> int:
     """The command ``forecast``; its exit status is 3 if something in the record contradicts the estimate."""
     options = _forecast_parser().parse_args(arguments)
-    from battery_env.lab.running import end_of_record, files_of  # here, as matplotlib takes long to import
+    from battery_env.lab.running import end_of_record, figure_of  # here, as matplotlib takes long to import
 
     settings, file_format = _settings(options), _file_format(options)
     if options.life and settings.prior_q_mobile_C is not None:
         raise ValueError("--life and --prior say the same: give one of them")
-    written = files_of(options.record, options.out) if options.out else []
-    if written:
-        check_new(*written)
+    figure = figure_of(options.record, options.out) if options.out else None
+    if figure:
+        check_new(figure)
     with _saying(), saying_that_it_compiles():
         end = end_of_record(options.record, settings, file_format, options.life, options.load)
     print(json.dumps(end.row()) if options.json else end.text())
-    for path in written:
-        end.write(path)
-    if written and not options.json:
-        print(f"\nwritten: {', '.join(map(str, written))}")
+    if figure:
+        end.draw(figure)
+        if not options.json:
+            print(f"\nwritten: {figure}")
     return NOT_SETTLED if end.contradicted else SETTLED
 
 
@@ -478,13 +478,11 @@ def _columns(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("record", type=Path, metavar="FILE", help="of a tester")
     parser.add_argument("--out", type=Path, default=Path("my_tester.toml"), metavar="FILE.toml", help="default: %(default)s")
-    parser.add_argument("--tester", type=find_tester, metavar="FILE.toml", help="what is known of the tester so far")
     options = parser.parse_args(arguments)
     check_new(options.out)
-    file_format = FileFormat(tester=options.tester)
     with _saying():
-        opened = open_file(options.record, file_format)
-        found = recognise(opened.names, file_format, opened.rows)
+        opened = open_file(options.record, FileFormat())
+        found = recognise(opened.names, FileFormat(), opened.rows)
     print("\n".join(found.lines()))
     with replacing(options.out, new=True) as part:
         part.write_text(tester_file(found.columns, opened.names, opened.rows), encoding="utf-8")

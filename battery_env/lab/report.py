@@ -201,21 +201,22 @@ def _of_the_load(found: Calibration) -> str:
     return f"{sd}{found.future_current_A:.3g} A {goes_on}"
 
 
-def line_of(name: str, found: Calibration) -> str:
-    """The same in one line."""
+def _numbers(found: Calibration) -> list[str]:
+    """The columns of a line."""
     parts = []
     for column, width, digits in _IN_A_LINE:
         if not np.isnan(getattr(found, column)):
             sd, label = found.sd_of(column), _HOW[column]["text"].split()[-1]
             parts.append(f"{label} {found.shown(column, digits):>{width}}" + (f" sd {sd:>3}" if sd else ""))
-    return f"{name:<18} " + "  ".join([*parts, f"{found.state}: {found.reason}".removesuffix(": ")])
+    return parts
+
+
+def line_of(name: str, found: Calibration) -> str:
+    """The same in one line."""
+    return f"{name:<18} " + "  ".join([*_numbers(found), f"{found.state}: {found.reason}".removesuffix(": ")])
 
 
 def title_of(name: str, found: Calibration) -> str:
     """The same above a figure."""
-    parts = []
-    for parameter, column in _COLUMN_OF.items():
-        sd = found.sd_of(column) or "not stated"
-        parts.append(f"{PARAMETERS[parameter].symbol} {found.shown(column)} (sd {sd})".replace("mohm", r"m$\Omega$"))
-    parts += [f"{found.shown('drawn_Ah')} drawn", f"RMSE {found.shown('voltage_rmse_V', 0)}"]
-    return f"{name}: {found.state}\n{', '.join(parts)}"
+    numbers = ", ".join(" ".join(each.split()) for each in _numbers(found))
+    return f"{name}: {found.state}\n{numbers}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -97,17 +96,14 @@ class End:
             lines.append(f"q_max before: {mean_Ah:.{digits}f} Ah, sd {sd_Ah:.{digits}f} Ah")
         return "\n".join([*lines, self.forecast.summary()])
 
-    def write(self, path: Path) -> None:
-        """Write a new file: JSON of the row, or a figure."""
-        with replacing(path, new=True) as part:
-            if path.suffix == ".json":
-                part.write_text(json.dumps(self.row(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-            else:
-                from battery_env.plotting import literal  # here, as matplotlib takes long to import
+    def draw(self, path: Path) -> None:
+        """Write a new figure."""
+        from battery_env.plotting import literal  # here, as matplotlib takes long to import
 
-                figure = self.forecast.plot()
-                figure.suptitle(f"{literal(self.name)}, then {self.forecast.load_name}", fontsize=10)
-                figure.savefig(part, dpi="figure")
+        figure = self.forecast.plot()
+        figure.suptitle(f"{literal(self.name)}, then {self.forecast.load_name}", fontsize=10)
+        with replacing(path, new=True) as part:
+            figure.savefig(part, dpi="figure")
 
 
 def forecast_end(
@@ -167,11 +163,10 @@ def read_load(path: str | Path) -> Load:
     return load
 
 
-def files_of(argument: str, folder: Path) -> list[Path]:
-    """Where the end of a record is written to, which is named as on the command line."""
+def figure_of(argument: str, folder: Path) -> Path:
+    """Where the end of a record is drawn, which is named as on the command line."""
     source = find_sources([argument])[0]
-    name = record_name(source.stem, source.cycle)
-    return [folder / f"{name}_forecast.{suffix}" for suffix in ("json", "png")]
+    return folder / f"{record_name(source.stem, source.cycle)}_forecast.png"
 
 
 def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:

@@ -160,7 +160,7 @@ class TestDataset:
     def test_a_task_that_knows_one_equilibrium_voltage_refuses_it(self, path):
         import gymnasium as gym
 
-        with pytest.raises(ValueError, match="equilibrium voltage"):
+        with pytest.raises(ValueError, match="constants of their own"):
             gym.make("BatteryJoint-v0", dataset=TrajectoryDataset.along(path, 4, [LOAD], seed=3))
 
     def test_what_is_no_path_is_refused(self):
