@@ -127,13 +127,14 @@ def seconds(values: pd.Series, column: Column) -> FloatArray:
         # dates in digits, as 20260227225000
         return _total_s(pd.to_datetime(values.astype("Int64").astype("string"), format="%Y%m%d%H%M%S", errors="coerce"))
     text = values.astype("string").str.strip().replace("", pd.NA)
-    if 2 * (text.str.count(":") > 0).sum() <= text.notna().sum():
+    if 2 * text.str.contains(":").sum() <= text.notna().sum():
         return numbers(values, column)
-    text = text.str.replace(r"(?<=\d),(?=\d)", ".", regex=True).str.replace(_DAYS, r"\1 days ", regex=True)
-    text = text.astype(object).where(text.notna(), None)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a day that is no month
         readings = [pd.to_timedelta(text, errors="coerce")]
+        if (readings[0] >= pd.Timedelta(0)).sum() < text.notna().sum():
+            text = text.str.replace(r"(?<=\d),(?=\d)", ".", regex=True).str.replace(_DAYS, r"\1 days ", regex=True)
+            readings = [pd.to_timedelta(text, errors="coerce")]
         if readings[0].isna().mean() > 0.5:
             # UTC, as the clocks of a time zone are put forward and back
             readings = [pd.to_datetime(text, utc=True, errors="coerce", **each) for each in _DATES]

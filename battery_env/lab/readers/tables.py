@@ -181,7 +181,7 @@ def _open_text(content: bytes, file_format: FileFormat) -> Opened:
         if encoding == "utf-8":
             break
     (encoding, delimiter), number = _find_header(tables, file_format)
-    names, *rows = tables[encoding, delimiter][number : number + 1 + _FIRST_ROWS]
+    names, *rows = map(_filled, tables[encoding, delimiter][number : number + 1 + _FIRST_ROWS])
     _check(len(names), _MOST_COLUMNS, "columns")
     has_units = bool(rows) and are_units(rows[0])
     values = [row for row in rows[has_units:] if row]
@@ -230,26 +230,29 @@ def _read_text(content: bytes, options: dict[str, Any], found: Recognised) -> pd
 
 def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: FileFormat) -> tuple[Key, int]:
     """
-    In which of some tables, by delimiter or by sheet, and in which of its rows the names of the columns are: those of most
-    quantities of a record, above most rows of numbers in as many fields.
+    In which of some tables, by delimiter or by sheet, and in which of its rows the names of the columns are: above rows of
+    numbers in as many fields, those of most quantities of a record.
     """
-    candidates: dict[tuple[str, ...], tuple[int, int, int, Key]] = {}  # by names, which may come again
+    candidates: dict[tuple[str, ...], tuple[bool, int, int, int, Key]] = {}  # by names, which may come again
     has_numbers = False
     for key, rows in tables.items():
         counts = np.array([sum(bool(_NUMBER.match(field)) for field in row) for row in rows])
-        widths = np.where(counts > 1, [*map(len, rows)], 0)
-        has_numbers |= bool(widths.any())
+        # a delimiter may end each
+        widths = np.array([(len(row), len(_filled(row))) for row in rows]).reshape(-1, 2)
+        has_numbers |= bool((counts > 1).any())
         for n, row in enumerate(rows[:_HEAD_LINES]):
             if any(row) and not counts[n]:
-                fits = int((widths[n + 1 : n + 1 + _FIRST_ROWS] == len(row)).sum())
-                candidates.setdefault(tuple(row), (count_required(row, file_format), fits, n, key))
+                below = slice(n + 1, n + 1 + _FIRST_ROWS)
+                fits = int(((widths[below] == widths[n]).any(axis=1) & (counts[below] > 1)).sum())
+                found = (bool(fits), count_required(row, file_format), fits, n, key)
+                candidates.setdefault(tuple(_filled(row)), found)
     if not candidates and not has_numbers:
         raise ValueError("the file is empty")
-    best = max(candidates.values(), key=lambda each: each[:3], default=(0, 0, 0, None))
+    best = max(candidates.values(), key=lambda each: each[:4], default=(False, 0, 0, 0, None))
     if has_numbers and not any(best[:2]):
         raise ValueError("there is no line with the names of the columns above the numbers. Add one")
-    quantities, _, number, key = best
-    first = next(each[2] for each in candidates.values() if each[0] == quantities)
+    _, quantities, _, number, key = best
+    first = next(each[3] for each in candidates.values() if each[:2] == best[:2])
     if quantities and first != number:
         say(f"the header is line {number + 1}; the table of line {first + 1} is left out")
     return cast(Key, key), number
@@ -257,20 +260,17 @@ def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: Fil
 
 def _fields(line: str, delimiter: str) -> list[str]:
     line = line.lstrip("# ")  # numpy writes a header as a comment
-    if delimiter == _BLANKS and any(other in line for other in _DELIMITERS):
-        return []
     try:
         fields = line.split() if delimiter == _BLANKS else next(csv.reader([line], delimiter=delimiter), [])
     except csv.Error:
         return []
-    return _filled([field.strip().strip('"') for field in fields])
+    return [field.strip().strip('"') for field in fields]
 
 
-def _filled(fields: list[str]) -> list[str]:
-    """Without what is empty at the end, where some write a delimiter."""
-    while fields and not fields[-1]:
-        fields.pop()
-    return fields
+def _filled(fields: Sequence[str]) -> list[str]:
+    """Without what is empty at the end."""
+    most = max((n for n, field in enumerate(fields, start=1) if field), default=0)
+    return list(fields[:most])
 
 
 @contextmanager
