@@ -228,8 +228,8 @@ def _unit(text: str, quantity: str) -> str:
     """A unit as the table of units has it, or nothing; what is said behind it, as in ``V vs. Ref.``, is left out."""
     if quantity == "time" and _CLOCK.match(_letters(text)):
         return "s"
-    first = text.split()[:1]
-    return next((unit for unit in map(_letters, (text, *first)) if unit in _UNITS.get(quantity, {})), "")
+    units = map(_letters, (text, text.strip().partition(" ")[0]))
+    return next((unit for unit in units if unit in _UNITS.get(quantity, {})), "")
 
 
 def are_units(fields: Sequence[str]) -> bool:

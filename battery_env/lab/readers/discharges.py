@@ -148,10 +148,7 @@ def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) ->
 
 
 def read_recordings(source: str | Path | pd.DataFrame, file_format: FileFormat) -> list[Recording]:
-    """
-    The discharges of a file or a table before they are checked, so that one that cannot be used does not lose the others; one
-    at least.
-    """
+    """The discharges of a file or a table, one at least, before they are checked: one that cannot be used loses no other."""
     name = _name_of(source)
     try:
         if not isinstance(source, pd.DataFrame) and Path(source).suffix.lower() == ".mat":
