@@ -84,18 +84,16 @@ class LeastSquares(Estimator):
     *Standard deviations* follow from one likelihood (:mod:`~battery_env.estimators.error`). With ``mismatch_V`` of 0 the
     residuals are white, as of simulated records with noise. On a real cell they are the model's error, which a fit of half a
     discharge hides in its parameters. So an error of twice ``mismatch_V``, the error expected of the model, drifts along the
-    charge drawn, beside white noise. More samples do not average it out. The gain of the current sensor scales both
-    parameters and does not show in the voltage: state it as ``current_gain_sd``.
+    charge drawn, beside white noise. More samples do not average it out.
 
     *Nuisance constants* are not known exactly, and are estimated along with the parameters, each under a prior of its own; so
     can be an offset of the voltage sensor. Slow diffusion looks like a smaller ``q_mobile``, and slow kinetics like a larger
     ``r_o``: what the record does not tell apart is in the standard deviations of the parameters.
 
-    *Settled* means that the record alone determines every parameter searched for, with a standard deviation below
-    :data:`~battery_env.estimators.reasons.SETTLED_SHARES` of its value without any prior, and that nothing contradicts it:
-    the start, gaps and steps of the voltage, its fit, bounds, and a prior. Otherwise ``reason`` of the estimate says
-    which of these does not hold, the largest doubt first, and ``settled_q_mobile`` or ``settled_r_o`` whether one of the
-    numbers is settled all the same. An estimate that rests on a prior is not settled: it is as good as the prior.
+    *Settled* (:class:`~battery_env.Estimate`) means that the record alone determines every parameter searched for, with a
+    standard deviation below :data:`~battery_env.estimators.reasons.SETTLED_SHARES` of its value without any prior, and that
+    nothing contradicts it: the start, gaps and steps of the voltage, its fit, bounds, and a prior. An estimate that rests on a
+    prior is not settled: it is as good as the prior.
 
     *During a discharge*, :meth:`trace` with ``window_every_s`` estimates again and again from all samples so far. Before its
     knee a discharge says little about ``q_mobile``: carry (mean, standard deviation) over from an earlier one as
@@ -113,7 +111,7 @@ class LeastSquares(Estimator):
     :param mismatch_V: error to expect of the model itself, V, as above
     :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: as the record shows it
     :param window_every_s: time between the estimates of :meth:`trace`, s; ``None``: one estimate, at the end
-    :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
+    :param current_gain_sd: standard deviation of the gain of the current sensor, a share of it; no voltage shows it
     :param nuisance: what else is not known: standard deviations of the logarithms of constants, by name, e.g.
         ``{"kn": 0.2, "tDiffusion": 0.2}`` for two that are known to 20 %; and of the offset of the sensor in V, as
         ``"offset_V"``
@@ -332,8 +330,10 @@ class LeastSquares(Estimator):
             diagnosis.note_about(name, Reason.AT_BOUND)
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
         known = Assumptions(self.current_gain_sd, sd_soc / soc, is_along_path=self.path is not None)
-        own_sds = fitted.sd(alone, {"q_mobile": self._sd_ratio})
-        return diagnosis.verdict(alone.values, own_sds, free, priors, known)
+        # where the record has it and where a prior has moved it: beside its knee the voltage says little of q_mobile
+        moved_there = replace(fit, jacobian=np.vstack([fit.jacobian[:n], alone.jacobian[n:]]))
+        own_sds = [fitted.sd(each, {"q_mobile": self._sd_ratio}) for each in (alone, moved_there)]
+        return diagnosis.verdict(alone.values, {name: max(sd[name] for sd in own_sds) for name in free}, free, priors, known)
 
 
 def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) -> dict[str, float]:

@@ -114,7 +114,7 @@ VERDICTS = {
         {"parameters": ["q_mobile"], "cell": NEW_CELL.replace(r_o=0.12), "mismatch_V": 0.0, "voltage_noise_V": 0.005}, MISFIT,
     ),
     "misfit by a prior": (BOTH[1:], REAL.loaded_part(2.7), {"prior_q_mobile_C": (8000.0, 80.0)}, MISFIT),
-    "prior of another end": (BOTH[:1], WHOLE, {"prior_q_mobile_C": (8000.0, 80.0)}, "The prior of q_max contradicts"),
+    "prior beside the knee": (BOTH[:1], discharged(2.9, 4400.0, 0.24), {"prior_q_mobile_C": (5280.0, 69.0)}, "q_max rests on"),
     "wrong prior of q_mobile": (BOTH[:1], WHOLE, {"prior_q_mobile_C": (5400.0, 20.0)}, "The prior of q_max contradicts"),
     "wrong prior, filter": (BOTH[1:], WHOLE, {"prior_q_mobile_C": (5700.0, 60.0)}, "The prior of q_max contradicts"),
     "wrong prior of r_o": (BOTH[1:], WHOLE, {"prior_r_o_ohm": (0.25, 0.02)}, "The prior of R_o contradicts"),
@@ -161,7 +161,7 @@ VERDICTS = {
     ),
 }  # fmt: skip
 
-#: The number that is settled all the same.
+#: The number that is settled all the same; below, of the filter.
 ALONE = {
     "not drawn": "r_o",
     "noise hides whether it was drawn": "r_o",
@@ -171,13 +171,13 @@ ALONE = {
     "gain of the current": "r_o",
     "charge at the start": "r_o",
     "prior of q_mobile": "r_o",
+    "prior beside the knee": "r_o",
     "half a discharge": "r_o",
     "a small current": "q_mobile",
     "constants of one load": "q_mobile",
     "current lost in noise": "q_mobile",
     "its gain, for r_o": "q_mobile",
 }
-#: And of the filter.
 ALONE_FILTERED = {"prior of r_o": "q_mobile", "not drawn": None}
 
 
