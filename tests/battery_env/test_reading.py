@@ -465,7 +465,7 @@ def test_a_tester_is_told_by_its_names_or_added_by_a_file(tmp_path, capsys, monk
     assert calibrate("cell.csv", tester="my_tester.toml")[0].settled
     assert command(["columns", "cell.csv"]) == 2  # nothing is overwritten
     assert "my_tester.toml would be replaced" in capsys.readouterr().err
-    faults = (("a = 1", "a tester has name"), ("[columns", "no file in TOML"), ("[columns]\nx='y'", "by quantity"))
+    faults = (("a = 1", "a tester has name"), ("[columns", "in TOML"), ("[columns]\nx='y'", "by quantity"))
     for content, said in faults:
         Path("bad.toml").write_text(content)
         with pytest.raises(ValueError, match=f"bad.toml.*{said}"):
