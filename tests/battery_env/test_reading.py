@@ -376,7 +376,7 @@ def test_another_count_of_the_tester_is_a_doubt_of_its_size(gain, method):
     assert discharge.history.uncounted_C == pytest.approx(abs(gain - 1.0) * 3600.0 * COUNTED_AH[-1], rel=0.1)
     found = calibrate(discharge, method=method)
     assert found.sd_q_mobile_C > 0.95 * discharge.history.uncounted_C and not found.settled_q_mobile
-    assert "The tester counted another charge" in found.reason
+    assert "the tester counted another charge" in found.reason
 
 
 def test_a_count_that_starts_anew_while_the_load_is_switched_tells_nothing_of_that():
