@@ -21,13 +21,16 @@ from itertools import product
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from battery_env.evaluation import over_seeds
+from battery_env.plotting import coloured
 from benchmarks.control import DISTURBANCES, IMPULSE_INTERVAL, conditions, roll_out
 from benchmarks.runs import Run, make_rows, rows_command_line, setting_of_lac
-from benchmarks.study import Study, digits, markdown, natural, table_of
+from benchmarks.study import Study, add_legend, digits, markdown, natural, new_panels, table_of, with_interval
 
 #: By environment the parameter that is drawn, its range, and a value outside; the first three are trained by default.
 PARAMETERS = {
@@ -40,7 +43,7 @@ PARAMETERS = {
 }
 #: What is outside of the ranges of pushes and noises, in parts of their ends; delays are a step longer.
 BEYOND = 1.5
-TIMESTEPS = 60_000
+TIMESTEPS = 30_000
 ALGORITHMS = {
     "lac": ("LAC", "sb3_lac:LAC"),
     "sac": ("SAC", "stable_baselines3:SAC"),
@@ -101,11 +104,11 @@ def costs(model: OffPolicyAlgorithm, run: Run) -> dict[str, float]:
 
 
 def cost_table(rows: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
-    """Interquartile means over seeds, and in brackets the share of episodes that die, if some do."""
+    """Interquartile means over seeds with their intervals, and the share of episodes that die, if some do."""
 
     def said(group: pd.DataFrame, name: str) -> str:
         died = group[f"died: {name}"].mean()
-        return digits(float(over_seeds(group[name])[0])) + (f" ({100 * died:.0f} %)" if died > 0 else "")
+        return with_interval(group[name]) + (f" ({digits(100 * died, 1)} %)" if died > 0 else "")
 
     cells = {"seeds": lambda group: str(len(group))}
     cells |= {name.removeprefix("outside: "): partial(said, name=name) for name in names}
@@ -126,11 +129,32 @@ def cells_held(rows: pd.DataFrame, names: Sequence[str]) -> str:
     return f"{held} of {of}"
 
 
+def plot(rows: pd.DataFrame, names: Sequence[str]) -> Figure:
+    """The cost under each disturbance: interquartile means over seeds, and their intervals."""
+    tasks = list(rows["task"].unique())
+    figure, panels = new_panels(len(tasks), 3, (3.6, 3.6), margin=(0.6, 0.3))
+    for axes, task in zip(panels, tasks, strict=True):
+        of_task = rows[rows["task"] == task]
+        policies = list(of_task["algorithm"].unique())
+        for n, (colour, policy) in enumerate(coloured(policies)):
+            middle, low, high = over_seeds(of_task.loc[of_task["algorithm"] == policy, list(names)])
+            places = np.arange(len(names)) + 0.7 * (n + 0.5) / len(policies) - 0.35
+            axes.hlines(places, low, high, color=colour, lw=1.4)
+            axes.plot(middle, places, "o", color=colour, ms=4, label=policy)
+        axes.set(title=task, xscale="log", xlabel="cost per step")
+        axes.set_yticks(range(len(names)), names if axes is panels[0] else [""] * len(names))
+        axes.invert_yaxis()
+        axes.grid(axis="x", alpha=0.25)
+    add_legend(figure, panels, 3)
+    return figure
+
+
 def report(rows: pd.DataFrame, within: Sequence[str], beyond: Sequence[str]) -> str:
     """Two tables, as Markdown."""
     text = ""
     for where, names in (("Within the ranges of the training", within), ("Outside of them", beyond)):
-        text += f"{where}: cost per step, interquartile mean over seeds, and in brackets the share of episodes that die.\n"
+        text += f"{where}: cost per step, interquartile mean over seeds with its 95 % interval, and the share of episodes\n"
+        text += "that die.\n"
         text += f"LAC is ahead of the best of SAC and TQC, or within 2 %, in {cells_held(rows, names)} cells:\n\n"
         text += markdown(cost_table(rows, names)) + "\n"
     return text.rstrip() + "\n"
@@ -155,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     within = list(conditions(chosen.envs[0]))
     beyond = [f"outside: {name}" for name in outside(chosen.envs[0])]
-    study.write({}, {}, report(done, within, beyond))
+    study.write({}, {"costs": plot(done, [*within, *beyond])}, report(done, within, beyond))
 
 
 if __name__ == "__main__":

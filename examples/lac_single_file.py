@@ -107,7 +107,7 @@ class LAC:
         self.critic_target = deepcopy(self.critic).requires_grad_(False)
         # Weights of the cost and of the entropy in the loss of the actor: multipliers of two constraints, as logarithms
         self.log_lambda = th.zeros(1, requires_grad=True)
-        self.log_ent_coef = th.zeros(1, requires_grad=True)
+        self.log_ent_coef = th.full((1,), 0.1).log().requires_grad_()  # learned from 0.1 on
         self.target_entropy = -float(n_actions)
         learned = (self.actor.parameters(), self.critic.parameters(), [self.log_lambda], [self.log_ent_coef])
         self.optimizers = [th.optim.Adam(parameters, lr=settings.learning_rate) for parameters in learned]

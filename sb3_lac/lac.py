@@ -71,10 +71,10 @@ class LAC(CostAlgorithm):
         Note: it is only used when ``replay_buffer_class`` is ``None``, and is not supported for Dict
         observation spaces yet.
     :param ent_coef: Entropy regularization coefficient (``beta`` in the paper).
-        Set it to 'auto' to learn it automatically (and 'auto_0.1' for using 0.1 as initial value)
+        It is learned from 0.1 on; 'auto' starts at 1, as SAC does, 'auto_0.01' at 0.01. A number is kept.
     :param target_update_interval: update the target networks every ``target_update_interval``
         gradient steps.
-    :param target_entropy: target entropy when learning ``ent_coef`` (``ent_coef = 'auto'``)
+    :param target_entropy: target entropy when learning ``ent_coef``
     :param alpha3: Share of the cost by which ``L`` has to decrease in each step. From 1 on the condition cannot hold
         in stationary data: ``lambda`` then stays at ``lambda_max``, a fixed weight of the cost. It may fall while ``L`` does.
     :param lambda_init: Initial value of ``lambda``, which is kept within the limits
@@ -132,7 +132,7 @@ class LAC(CostAlgorithm):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
-        ent_coef: str | float = "auto",
+        ent_coef: str | float = "auto_0.1",
         target_update_interval: int = 1,
         target_entropy: str | float = "auto",
         alpha3: float = 1.0,

@@ -52,7 +52,7 @@ def test_cells_are_counted_where_lac_is_ahead_or_level_with_those_that_saw_the_s
     assert changing_plant.cells_held(pd.DataFrame(rows[:4]), names) == "0 of 0"
     table = changing_plant.cost_table(pd.DataFrame([row("LAC", 1, 2.0, 0.5), row("LAC", 2, 4.0)]), ["outside: impulses"])
     assert table.to_dict("records") == [
-        {"environment": "CartPoleCost-v0", "policy": "LAC", "seeds": "2", "impulses": "3 (25 %)"}
+        {"environment": "CartPoleCost-v0", "policy": "LAC", "seeds": "2", "impulses": "3 [2, 4] (25 %)"}
     ]
 
 

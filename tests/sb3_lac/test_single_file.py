@@ -38,7 +38,6 @@ def test_its_steps_are_those_of_lac(make_model_without_env, train_metrics, singl
     modules.load_state_dict({name: tensor for name, tensor in before.items() if not name.startswith("log_")})
     with th.no_grad():
         agent.log_lambda.copy_(before["log_lambda"])
-        agent.log_ent_coef.copy_(before["log_ent_coef"])
 
     rng = np.random.default_rng(0)
     for step in range(5):
