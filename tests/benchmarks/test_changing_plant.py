@@ -49,7 +49,8 @@ def test_cells_are_counted_where_lac_is_ahead_or_level_with_those_that_saw_the_s
     assert changing_plant.cells_held(pd.DataFrame(rows), names) == "2 of 2"
     rows += [row(f"{name}, 2 last actions", 1, cost) for name, cost in (("LAC", 1.03), ("SAC", 1.0), ("TQC", 3.0))]
     assert changing_plant.cells_held(pd.DataFrame(rows), names) == "2 of 4"
-    assert changing_plant.cells_held(pd.DataFrame(rows[:4]), names) == "0 of 0"
+    assert changing_plant.cells_held(pd.DataFrame(rows[:4]), names) == "2 of 2"  # of SAC alone
+    assert changing_plant.cells_held(pd.DataFrame(rows[:2]), names) == "0 of 0"
     table = changing_plant.cost_table(pd.DataFrame([row("LAC", 1, 2.0, 0.5), row("LAC", 2, 4.0)]), ["outside: impulses"])
     assert table.to_dict("records") == [
         {"environment": "CartPoleCost-v0", "policy": "LAC", "seeds": "2", "impulses": "3 [2, 4] (25 %)"}
@@ -68,6 +69,6 @@ def test_the_study_trains_and_writes(tmp_path, monkeypatch, capsys):
     text = (tmp_path / "changing_plant.md").read_text()
     assert (
         text.count("| CartPoleCost-v0 | LAC, 2 last actions") == 2
-        and "0 of 0 cells" in text
+        and "of 12 cells" in text
         and text in capsys.readouterr().out
     )
