@@ -31,6 +31,7 @@ from battery_env.plotting import coloured
 from benchmarks.control import DISTURBANCES, IMPULSE_INTERVAL, conditions, roll_out
 from benchmarks.runs import Run, make_rows, rows_command_line, setting_of_lac
 from benchmarks.study import Study, add_legend, digits, markdown, natural, new_panels, table_of, with_interval
+from sb3_lac.stability.plots import format_log_axis
 
 #: By environment the parameter that is drawn, its range, and a value outside; the first three are trained by default.
 PARAMETERS = {
@@ -143,6 +144,7 @@ def plot(rows: pd.DataFrame, names: Sequence[str]) -> Figure:
             axes.hlines(places, low, high, color=colour, lw=1.4)
             axes.plot(middle, places, "o", color=colour, ms=4, label=policy)
         axes.set(title=task, xscale="log", xlabel="cost per step")
+        format_log_axis(axes.xaxis)
         axes.set_yticks(range(len(names)), names if axes is panels[0] else [""] * len(names))
         axes.invert_yaxis()
         axes.grid(axis="x", alpha=0.25)

@@ -9,8 +9,9 @@ LAC beside SAC, TD3 and TQC on tasks of Gymnasium, which nobody here made or tun
 
 Every algorithm has its defaults, but SAC, TD3 and TQC those settings of the RL Zoo that are tuned for a task with at most 50
 thousand steps. ``lac_common`` is LAC with its one setting for control problems, ``lac_higher_start`` has the weight of the
-entropy begin at 1, as SAC does. A policy is judged by its mean action, in 20 episodes that no training starts with. A training that is
-done is a row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command goes on from there.
+entropy begin at 1, as SAC does. A policy is judged by its mean action, in 20 episodes that no training starts with. A training
+that is done is a row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command goes on from
+there.
 """
 
 from __future__ import annotations

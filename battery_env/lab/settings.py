@@ -182,7 +182,7 @@ class Settings:
         if low_A / _SAME_LOAD <= current_A <= high_A * _SAME_LOAD:
             return ""
         fitted = f"{low_A:.3g}" if low_A == high_A else f"{low_A:.3g} to {high_A:.3g}"
-        return Reason.OTHER_LOAD.said({"load_A": current_A, "fitted": fitted})
+        return Reason.OTHER_LOAD.text.format(load_A=current_A, fitted=fitted)
 
     def tells_new_capacity(self, current_A: float) -> bool:
         """Whether the constants tell what a new cell yields under a load: where they were fitted to this load alone."""

@@ -76,7 +76,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
             seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed must be one number, or one for each of the {self.num_envs} cells, got {len(seeds)}")
-        before = self._generators or [None] * self.num_envs
+        before: list[np.random.Generator | None] = [*self._generators] or [None] * self.num_envs
         self._generators = [
             seeding.np_random(value)[0] if generator is None or value is not None else generator
             for generator, value in zip(before, seeds, strict=True)

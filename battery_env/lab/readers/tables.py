@@ -248,14 +248,14 @@ def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: Fil
                 candidates.setdefault(tuple(_filled(row)), found)
     if not candidates and not has_numbers:
         raise ValueError("the file is empty")
-    best = max(candidates.values(), key=lambda each: each[:4], default=(False, 0, 0, 0, None))
+    best = max(candidates.values(), key=lambda each: each[:4], default=(False, 0, 0, 0, next(iter(tables))))
     if has_numbers and not any(best[:2]):
         raise ValueError("there is no line with the names of the columns above the numbers. Add one")
     _, quantities, _, number, key = best
     first = next(each[3] for each in candidates.values() if each[:2] == best[:2])
     if quantities and first != number:
         say(f"the header is line {number + 1}; the table of line {first + 1} is left out")
-    return cast(Key, key), number
+    return key, number
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
