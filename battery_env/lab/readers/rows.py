@@ -132,7 +132,7 @@ def seconds(values: pd.Series, column: Column) -> FloatArray:
         return numbers(values, column)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a day that is no month
-        readings = [pd.to_timedelta(text, errors="coerce")]
+        readings: list[pd.Series] = [pd.to_timedelta(text, errors="coerce")]
         if (readings[0] >= pd.Timedelta(0)).sum() < text.notna().sum():
             text = text.str.replace(r"(?<=\d),(?=\d)", ".", regex=True).str.replace(_DAYS, r"\1 days ", regex=True)
             readings = [pd.to_timedelta(text, errors="coerce")]
