@@ -126,8 +126,7 @@ def seconds(values: pd.Series, column: Column) -> FloatArray:
             return found
         # dates in digits, as 20260227225000
         return _total_s(pd.to_datetime(values.astype("Int64").astype("string"), format="%Y%m%d%H%M%S", errors="coerce"))
-    text = values.astype("string").str.strip()
-    text = text.mask(text == "")
+    text = values.astype("string").str.strip().replace({"": pd.NA})
     if 2 * text.str.contains(":").sum() <= text.notna().sum():
         return numbers(values, column)
     with warnings.catch_warnings():
