@@ -260,8 +260,7 @@ MOST = {
     # lives whose files are not named in the order of their dates, and for settings that are given another cell
     ("lines", "battery_env"): 18_209,
     ("lines", "sb3_lac"): 6_886,
-    # 2 for readers of the outside tasks, whose table says which way is up; 28 for those of the plant that changes, whose
-    # costs have intervals and a picture: what LAC loses there would not be seen else, and nothing went for it
+    # 30 for who asks what LAC loses on tasks of others and on a plant that changes: a table, intervals and a picture
     ("lines", "benchmarks"): 6_165,
     # the same users: the page is started, asked by strangers, killed, and looked at in a browser;
     # and gaps between pulses, and lives in the order of their dates
