@@ -48,8 +48,8 @@ def test_arguments_are_those_of_sac_and_the_own_ones_follow_target_entropy():
     start = names.index("target_entropy") + 1
     assert names[start : start + len(own)] == own
     shared = [(parameter.name, parameter.default) for parameter in parameters if parameter.name not in own]
-    # 0.99 too, where the environment states no other one
-    others = {"gamma": "auto"}
+    # 0.99 too, where the environment states no other one; and a weight in a root's unit
+    others = {"gamma": "auto", "ent_coef": "auto_0.1"}
     assert shared == [(parameter.name, others.get(parameter.name, parameter.default)) for parameter in sac_parameters]
 
 

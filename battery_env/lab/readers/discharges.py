@@ -232,16 +232,16 @@ def _bounds(rows: pd.DataFrame) -> list[int]:
     time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
     are_charges_logged = any(charge.is_end for charge in _charges(current_A, _passed_C(time_s, current_A)))
     bounds, numbers = [0], [0, *np.flatnonzero(changes(rows, "cycle")), len(rows)]
-    of_cell, top_V, low_V = True, -np.inf, np.inf
+    of_cell, top_V = True, -np.inf
     for begin, end in itertools.pairwise(numbers):
-        highest_V, lowest_V = voltage_V[begin:end].max(), voltage_V[begin:end].min()
+        highest_V = voltage_V[begin:end].max()
         was_of_cell, of_cell = of_cell, np.abs(current_A[begin:end]).max() <= LOAD_LIMITS["current"]
-        fell_V = top_V - low_V
+        fell_V = top_V - voltage_V[begin - 1]  # a charge ends at the top
         is_back = fell_V > MUCH_SHARE * np.ptp(voltage_V) and top_V - highest_V < MUCH_SHARE * fell_V
         if begin and (time_s[begin] < time_s[begin - 1] or of_cell != was_of_cell or (is_back and not are_charges_logged)):
             bounds.append(int(begin))
-            top_V, low_V = highest_V, lowest_V
-        top_V, low_V = max(top_V, highest_V), min(low_V, lowest_V)
+            top_V = highest_V
+        top_V = max(top_V, highest_V)
     return [*bounds, len(rows)]
 
 
