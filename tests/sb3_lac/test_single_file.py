@@ -64,7 +64,7 @@ def test_its_steps_are_those_of_lac(make_model_without_env, train_metrics, singl
 @pytest.mark.attacks
 def test_it_learns_the_linear_problem(single_file):
     untrained, trained = (single_file["main"](n_steps=n_steps) for n_steps in (1, 1_500))
-    assert trained < 0.2 * untrained
+    assert trained < 0.3 * untrained  # the best controller: 0.2
 
 
 def test_it_can_be_read_at_once():

@@ -108,10 +108,8 @@ def manager_of(env_id, folder, algo="lac", **options):
 
 def test_trials_on_batteries_are_scored_on_held_out_discharges(workdir):
     manager = manager_of("BatteryRo-v0", workdir, optimize_hyperparameters=True, env_kwargs={"initial_perturbation": 0.1})
-    training, evaluation = (
-        set(manager.create_envs(1, no_log=True, eval_env=eval_env).get_attr("task")[0].dataset.r_o)
-        for eval_env in (False, True)
-    )
+    datasets = [manager.create_envs(1, no_log=True, eval_env=each).get_attr("task")[0].dataset for each in (False, True)]
+    training, evaluation = (set(zip(data.r_o, data.eod_time_s, strict=True)) for data in datasets)
     assert training and evaluation and not training & evaluation
     asked = manager_of("BatteryRo-v0", workdir, eval_env_kwargs={"split": "all"}, optimize_hyperparameters=True)
     assert asked.eval_env_kwargs == {"split": "all"}
