@@ -15,10 +15,14 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_load, check_numbers, check_positive, check_range
 from battery_env.records import Record, is_load, load_span, resample_current, switches
 
+_MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
+#: The blocks of :class:`BlockBootstrap`, as a share of the record.
+BLOCK_SHARE = 0.1
+
 
 def _check_segments(total_s: float, name: str, shortest_s: float) -> None:
-    if total_s / shortest_s > 1e6:  # then a time is meant in another unit
-        raise ValueError(f"total_s and {name} make more than 1e+06 segments, got {total_s!r} and {shortest_s!r}")
+    if total_s / shortest_s > _MOST_SEGMENTS:
+        raise ValueError(f"total_s and {name} make more than {_MOST_SEGMENTS:g} segments, got {total_s!r} and {shortest_s!r}")
 
 
 class KnownLoad(ABC):
@@ -355,7 +359,7 @@ class BlockBootstrap(RandomLoad):
 
     @cached_property
     def _length(self) -> int:
-        block_s = self.block_s or 0.1 * self.dt_s * len(self._values)
+        block_s = self.block_s or BLOCK_SHARE * self.dt_s * len(self._values)
         return max(round(block_s / self.dt_s), 1)
 
     def __call__(self, rng: np.random.Generator) -> KnownLoad:

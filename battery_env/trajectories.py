@@ -38,9 +38,16 @@ from battery_env.parameters import Q_MOBILE, R_O, check_parameters
 #: Ranges of the aged parameters in the paper's data (the authors' code), C and ohm.
 PAPER_RANGES: dict[str, tuple[float, float]] = {"q_mobile": (4000.0, 7000.0), "r_o": (0.1, 0.2)}
 PAPER_LOADS_W: tuple[float, ...] = tuple(np.linspace(8.0, 16.0, 11))
+PAPER_VALUES = 501
 PAPER_TRIM = (0.05, 0.95)
 
+#: Largest ``mismatch`` of :meth:`TrajectoryDataset.generate`: beyond, the constants would be another cell's.
+MISMATCH_LIMIT = 0.5
+
 _CHECKPOINT_EVERY = 64  # steps between stored states: a window starts with 32 steps of re-simulation on average
+_MIN_SAMPLES = 8
+_LEFT_SAMPLES = 4  # of a discharge that is trimmed
+_LEAST_DT_S = 0.01  # of a discharge that may take a day
 _INDICES = ("load_start", "samples", "first", "stop", "checkpoint_start")
 _PER_TRAJECTORY = ("q_mobile", "r_o", "factors", "equilibrium_V", "eod_time_s", *_INDICES)
 _ARRAYS = (*_PER_TRAJECTORY, "load_values", "checkpoint")
@@ -139,8 +146,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         n, seed = check_whole_number("n", n), check_whole_number("seed", seed)
         if n < 1 or seed < 0:
             raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
-        if not isinstance(mismatch, Real) or not 0.0 <= mismatch <= 0.5:  # beyond, the constants would be another cell's
-            raise ValueError(f"mismatch is a relative standard deviation within 0 .. 0.5, got {mismatch!r}")
+        if not isinstance(mismatch, Real) or not 0.0 <= mismatch <= MISMATCH_LIMIT:
+            raise ValueError(f"mismatch is a relative standard deviation within 0 .. {MISMATCH_LIMIT:g}, got {mismatch!r}")
         q_range, r_range = check_range("q_mobile_range", q_mobile_range), check_range("r_o_range", r_o_range)
         Q_MOBILE.check(q_range)
         R_O.check(r_range)
@@ -226,8 +233,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         ).copy()
         cell = check_cell(cell, thermal)
         dt_s = _check_dt(dt_s, cell, multiples)
-        if dt_s < 0.01:
-            raise ValueError(f"dt_s must be at least 0.01 s (a day of it must fit in memory), got {dt_s!r}")
+        if dt_s < _LEAST_DT_S:
+            raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of it must fit in memory), got {dt_s!r}")
         profiles, samples, checkpoints = _discharged(q, r, loads, index, dt_s, thermal, cell, multiples, added_V)
         return TrajectoryDataset(
             q_mobile=np.array(q),
@@ -257,8 +264,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         if not 0.0 <= low < high <= 1.0:
             raise ValueError(f"low and high must be two increasing shares within 0 .. 1, got {low!r} and {high!r}")
-        first = np.minimum(np.ceil(low * self.samples).astype(np.int64), self.samples - 4)
-        stop = np.maximum(np.floor(high * self.samples).astype(np.int64), first + 4)
+        first = np.minimum(np.ceil(low * self.samples).astype(np.int64), self.samples - _LEFT_SAMPLES)
+        stop = np.maximum(np.floor(high * self.samples).astype(np.int64), first + _LEFT_SAMPLES)
         return replace(self, first=first, stop=stop)
 
     @classmethod
@@ -523,10 +530,10 @@ def _discharged(
             state[0] = start[n]
             packed = _packed(cell, factors[[n]], equilibrium_V[[n]])
             samples[n] = roll_out(profile, q_mobile[n], r_o[n], dt_s, cell.VEOD, is_power, thermal, packed, state, columns)
-            if samples[n] < 8:
+            if samples[n] < _MIN_SAMPLES:
                 raise ValueError(
                     f"trajectory {n} (q_mobile {q_mobile[n]:g} C, r_o {r_o[n]:g} ohm) ends after {samples[n]} samples, at "
-                    f"least 8 are needed: lower its load ({load.value[0]:g}), r_o or dt_s ({dt_s:g})"
+                    f"least {_MIN_SAMPLES} are needed: lower its load ({load.value[0]:g}), r_o or dt_s ({dt_s:g})"
                 )
             if samples[n] == len(day):
                 raise ValueError(f"trajectory {n} does not reach the end of discharge within a day: raise its load")
@@ -573,13 +580,12 @@ def _starts(lengths: IntArray) -> IntArray:
 
 @lru_cache(maxsize=2)
 def _paper(parameter: str) -> TrajectoryDataset:
-    ages = np.linspace(*PAPER_RANGES[parameter], 501)
-    value = np.tile(ages, len(PAPER_LOADS_W))
+    value = np.tile(np.linspace(*PAPER_RANGES[parameter], PAPER_VALUES), len(PAPER_LOADS_W))
     fixed = np.full_like(value, NEW_CELL.r_o if parameter == "q_mobile" else NEW_CELL.q_mobile)
     whole = TrajectoryDataset.simulated(
         q_mobile=value if parameter == "q_mobile" else fixed,
         r_o=fixed if parameter == "q_mobile" else value,
         loads=[constant(power) for power in PAPER_LOADS_W],
-        load_index=np.repeat(np.arange(len(PAPER_LOADS_W)), len(ages)),
+        load_index=np.repeat(np.arange(len(PAPER_LOADS_W)), PAPER_VALUES),
     )
     return whole.trimmed(*PAPER_TRIM)

@@ -31,9 +31,18 @@ PATH_NAMES: tuple[str, ...] = (*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES, *PARAME
 SPREAD_SD: tuple[float, ...] = (*(0.5,) * len(UNCERTAIN_CONSTANTS), *(0.005,) * EQUILIBRIUM_SIZE, 0.03, 0.25)
 #: A cell that lies farther beside the path, in standard deviations, is of another kind.
 BESIDE_LIMIT_SD = 4.0
+#: Cells may be younger and older than those of the path by this share of its length.
+BEYOND_SHARE = 0.2
 
+# How unsure n lives leave what another cell is: standard deviations are 1 + _FEW_LIVES / n times as large. Chosen on B0006
+# along the path of B0005.
+_FEW_LIVES = 2.0
 _FORMAT, _FORMAT_VERSION = "battery_env.AgingPath", 1
 _RATES, _EQUILIBRIUM = slice(0, len(UNCERTAIN_CONSTANTS)), slice(len(UNCERTAIN_CONSTANTS), -len(PARAMETER_NAMES))
+# Beyond its ends a path goes on as over this share of its ages, as single ones scatter.
+_END_SHARE = 0.25
+# Moments of the distribution are those of so many cells.
+_MOMENTS_CELLS, _MOMENTS_SEED = 4000, 0
 
 
 class DrawnCells(NamedTuple):
@@ -107,8 +116,7 @@ class AgingPath:
         if n < 1 or seed < 0:
             raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
         rng = np.random.default_rng(seed)
-        # a fifth of its length younger and older than the cells of the path
-        life, place = rng.integers(len(self.lives), size=n), rng.uniform(-0.2, 1.2, size=n)
+        life, place = rng.integers(len(self.lives), size=n), rng.uniform(-BEYOND_SHARE, 1.0 + BEYOND_SHARE, size=n)
         values = np.empty((n, len(PATH_NAMES)))
         for k, rows in enumerate(self.lives):
             values[life == k] = _at(np.array(rows), place[life == k])
@@ -120,7 +128,7 @@ class AgingPath:
     @cached_property
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of ``PATH_NAMES`` over the cells that are expected, shapes (14,) and (14, 14)."""
-        _, q_mobile, r_o, factors, equilibrium_V = self.draw(4000, seed=0)
+        _, q_mobile, r_o, factors, equilibrium_V = self.draw(_MOMENTS_CELLS, _MOMENTS_SEED)
         values = np.column_stack([np.log(factors), equilibrium_V, np.log(q_mobile), np.log(r_o)])
         return values.mean(axis=0), np.cov(values.T)
 
@@ -135,8 +143,7 @@ class AgingPath:
         So many times larger than a fit along the path says are the standard deviations that are stated, and the one of
         ``q_mobile`` that has to be small to be settled: 3 for the path of one life, 2 for that of two.
         """
-        # chosen on B0006 along the path of B0005
-        return 1.0 + 2.0 / len(self.lives)
+        return 1.0 + _FEW_LIVES / len(self.lives)
 
     def distance_sd(self, values: Mapping[str, float]) -> float:
         """
@@ -234,8 +241,7 @@ def _at(rows: FloatArray, place: FloatArray) -> FloatArray:
     left = np.minimum(at.astype(np.int64), last - 1)
     share = (at - left)[:, None]
     values = (1.0 - share) * rows[left] + share * rows[left + 1]
-    # over a quarter of them, as single ones scatter
-    span = max(round(0.25 * last), 1)
+    span = max(round(_END_SHARE * last), 1)
     before, after = rows[span] - rows[0], rows[last] - rows[last - span]
     values += np.minimum(place, 0.0)[:, None] * last / span * before
     values += np.maximum(place - 1.0, 0.0)[:, None] * last / span * after

@@ -50,6 +50,7 @@ CONSTANTS_SIZE, POLYNOMIAL_SIZE = 13, 14
 UNCERTAIN_CONSTANTS: tuple[str, ...] = ("kn", "tDiffusion", "to", "tsn")
 
 _FORMAT, _FORMAT_VERSION = "battery_env.CellParameters", 1
+_SIX_TENTHS = 0.6  # xnMax - xnMin: the share of all lithium sites that a full discharge uses
 
 
 class PackedConstants(NamedTuple):
@@ -83,6 +84,7 @@ def _redlich_kister_polynomial(coefficients: tuple[float, ...], faraday: float) 
 
 # How far a constant may be from that of a new 18650, as a factor: two are of nature; large cells are known by the others.
 _FARTHEST = {"R": 1.01, "F": 1.01, "Tb0": 2.0, "VEOD": 10.0}
+_FARTHEST_OF_OTHERS = 1e9
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ class CellParameters:
             if field.name not in ("U0n", "U0p", "An", "Ap", "r_o") and not value > 0.0:
                 raise ValueError(f"CellParameters: {field.name} must be greater than 0, got {value!r}")
             usual = max(map(abs, field.default if isinstance(field.default, tuple) else (field.default,)))
-            factor = _FARTHEST.get(field.name, 1e9)
+            factor = _FARTHEST.get(field.name, _FARTHEST_OF_OTHERS)
             least = 0.0 if field.name in ("U0n", "U0p", "An", "Ap", "r_o") else usual / factor
             if not all(least <= abs(number) <= factor * usual for number in numbers):
                 off = f"is more than {factor:g} times off the {usual:g} of a new 18650"
@@ -225,8 +227,7 @@ class CellParameters:
         volume_surface = self.VolSFraction * self.Vol
         constants = np.empty((1, CONSTANTS_SIZE))
         row = constants[0]
-        # xnMax - xnMin: a full discharge uses 0.6 of all lithium sites
-        row[FRACTION_PER_SHARE] = 0.6 / self.VolSFraction
+        row[FRACTION_PER_SHARE] = _SIX_TENTHS / self.VolSFraction
         row[BULK_RATE] = 1.0 / ((self.Vol - volume_surface) * self.tDiffusion)
         row[SURFACE_RATE] = 1.0 / (volume_surface * self.tDiffusion)
         row[R_OVER_F] = self.R / self.F
@@ -261,6 +262,8 @@ class CellParameters:
 NEW_CELL = CellParameters()
 #: The charge that can move is about this much more than what a discharge delivers.
 UNDELIVERED = 1.05
+# A cell that holds less or more than the new one by this factor is one of another size.
+_OTHER_SIZE = 2.0
 
 
 def rest_shares(soc: float = 1.0) -> FloatArray:
@@ -293,7 +296,7 @@ def check_dt(dt: float, cell: CellParameters) -> float:
 def new_cell_of(q_mobile_C: float) -> CellParameters:
     """A new cell that holds so much: an 18650 within a factor of two, else one whose surfaces and mass go with its charge."""
     size = q_mobile_C / NEW_CELL.q_mobile
-    if 0.5 < size < 2.0:
+    if 1.0 / _OTHER_SIZE < size < _OTHER_SIZE:
         return NEW_CELL
     surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
     return NEW_CELL.replace(q_mobile=q_mobile_C, r_o=NEW_CELL.r_o / size, **surfaces)

@@ -37,6 +37,7 @@ SURPLUS_SHARE = 0.01
 _CHUNK_STEPS = 512
 # Rows of what is followed of cells: what they are, and the sum of their currents, the last current and voltage, and their end.
 _Q, _R_O, _ERROR, _DRIFT, _FIRST_SOC, _UNTIL, _SUM_A, _LAST_A, _LAST_V, _END, _END_SOC = range(11)
+_AT_FIRST = (0.0, np.nan, np.nan, np.inf, np.nan)
 
 
 class Model(Protocol):
@@ -190,7 +191,7 @@ class _Run(NamedTuple):
 def _followed(cells: Cells, until: FloatArray) -> FloatArray:
     """What is followed of cells, at first."""
     known = (cells.q_mobile, cells.r_o, cells.error_V, cells.drift_V, cells.soc, until)
-    return np.vstack([*known, np.repeat(np.array([0.0, np.nan, np.nan, np.inf, np.nan])[:, None], len(until), axis=1)])
+    return np.vstack([*known, np.repeat(np.array(_AT_FIRST)[:, None], len(until), axis=1)])
 
 
 @compiled

@@ -13,6 +13,9 @@ from numpy.polynomial.legendre import legvander
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry.cell import CellParameters
 
+# Mole fractions of the positive electrode at full charge and at none.
+_FRACTIONS_P = (0.4, 1.0)
+
 
 def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
     """
@@ -48,5 +51,5 @@ def equilibrium_slopes(fraction_p: FloatArray, count: int) -> FloatArray:
 
 def on_unit_range(fraction: Any) -> Any:
     """Mole fractions of the positive electrode as -1 .. 1: numbers, arrays and polynomials alike."""
-    low, high = 0.4, 1.0  # at full charge and at none
+    low, high = _FRACTIONS_P
     return (fraction - 0.5 * (high + low)) * (2.0 / (high - low))

@@ -45,9 +45,10 @@ from battery_env.electrochemistry.cell import (
     PackedConstants,
 )
 
-#: The extended model holds mole fractions this far inside 0 .. 1, and the voltage that turns power into current above 1 V;
+#: The extended model holds mole fractions this far inside 0 .. 1, and the voltage that turns power into current above this;
 #: no discharge comes to either above the cut-off.
 MOLE_FRACTION_MARGIN = 1e-3
+_VOLTAGE_FLOOR_V = 1.0
 
 # ln(x) for x = 2^k * m, m within sqrt(1/2) .. sqrt(2): bit patterns of float64, and the polynomial of (ln(1 + f) - 2 s) / s in
 # s^2, s = f / (2 + f), of FreeBSD's e_log.c (Sun Microsystems 1993)
@@ -142,7 +143,7 @@ def _equilibrium(xn: float, xp: float, tb: float, gas: float, u0: float, poly_n:
 def _current(load: float, voltage: float, extended: bool) -> float:
     # of a load that is power
     if extended:
-        return load / (1.0 if voltage < 1.0 else voltage)
+        return load / (_VOLTAGE_FLOOR_V if voltage < _VOLTAGE_FLOOR_V else voltage)
     return load / voltage if voltage > 0.0 else np.nan
 
 

@@ -26,6 +26,8 @@ from battery_env.electrochemistry.cell import (
 from battery_env.electrochemistry.kernels import advance_batch, roll_out, step_batch, voltage_batch
 from battery_env.parameters import Q_MOBILE, R_O
 
+_MAX_STEPS = 1e8  # of one simulation, in memory
+
 
 def _aged(
     cell: CellParameters | None, q_mobile: ArrayLike | None, r_o: ArrayLike | None = None, thermal: bool = False
@@ -271,8 +273,8 @@ def simulate(
     dt = check_dt(dt, constants)
     if q.ndim or r.ndim:
         raise ValueError(f"q_mobile and r_o must be single numbers, got shapes {q.shape} and {r.shape}")
-    if not isinstance(until, Real) or not 0.0 < until / dt <= 1e8:  # steps, which are held in memory
-        raise ValueError(f"until must be a time in s, greater than 0 and at most 1e8 steps of dt, got {until!r}")
+    if not isinstance(until, Real) or not 0.0 < until / dt <= _MAX_STEPS:
+        raise ValueError(f"until must be a time in s, greater than 0 and at most {_MAX_STEPS:g} steps of dt, got {until!r}")
     loads = _loads(load, load_unit, dt, int(np.floor(until / dt + 1e-9)) + 1)
     n_samples = len(loads)
     start = initial_state(q, constants) if initial is None else _check_state(initial)

@@ -14,7 +14,6 @@ from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, PATH_NAMES, AgingPath
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V
-from battery_env.estimators.diagnosis.rest import LEAST_ERROR_V
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, INDEPENDENT_ERRORS, LIMIT_V, fit_cell
 from battery_env.estimators.least_squares import LeastSquares
@@ -26,6 +25,8 @@ from battery_env.records.model import RecordModel
 
 # So many ages of a life are fitted, and so many of them at once for the constants that all share.
 _AGES, _JOINT_AGES = 12, 6
+# How strongly the priors of a single age weigh: the error of its model, V.
+_MISMATCH_V = 0.005
 # How nearly q_mobile is that of the constants known before.
 _SAME_Q_SHARE = 0.002
 
@@ -104,7 +105,7 @@ def _fit_age(record: Record, model: RecordModel, reference: LeastSquares, cut_of
     samples = check_record(loaded)
     nuisance = {name: RATE_PRIOR_SD[name] for name in UNCERTAIN_CONSTANTS}
     nuisance |= dict(zip(EQUILIBRIUM_NAMES, EQUILIBRIUM_PRIOR_SD_V, strict=True))
-    error_V, q_C = sqrt(len(samples.time_s) / INDEPENDENT_ERRORS) * LEAST_ERROR_V, reference.estimate(loaded).q_mobile
+    error_V, q_C = sqrt(len(samples.time_s) / INDEPENDENT_ERRORS) * _MISMATCH_V, reference.estimate(loaded).q_mobile
     search = replace(Search.of(samples, model, PARAMETER_NAMES, nuisance, reference.bounds), error=ErrorModel(noise_V=error_V))
     priors = [Prior(name, 0.0, 1.0 / sd) for name, sd in nuisance.items()]
     priors.append(Prior("q_mobile", q_C, 1.0 / (_SAME_Q_SHARE * q_C)))

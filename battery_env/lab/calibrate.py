@@ -41,6 +41,17 @@ from battery_env.records import STEADY_S, ExpectedCurrent, Samples, drawn, expec
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
+# A record of more samples than this is averaged over the time step of the model, or longer where it lasts longer than so many
+# steps: what lies between says nothing to the model.
+_MANY_SAMPLES = 100_000
+_MODEL_STEP_S = 1.0
+# What is drawn after the cut-off is worth a word if it is more than this share of what was drawn before.
+_MORE_SHARE = 0.2
+# So near to a bound, as a share of it, a search ended at it.
+_AT_BOUND = 1e-3
+# Nine of ten values of a normal distribution lie within so many standard deviations.
+_BAND_SD = 1.645
+
 
 class Options(SettingsOptions, total=False):
     """Keywords of :func:`calibrate`: those of :class:`Settings`, and of :func:`battery_env.read_discharges`."""
@@ -179,10 +190,9 @@ def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
     """The part under load, how it starts, and what comes after it."""
     loaded, eod_time_s = discharge.loaded_part(settings.cut_off_V), discharge.eod_time_s(settings.cut_off_V)
     more_C = _charge_after(discharge, loaded, eod_time_s, settings.cut_off_V)
-    record, many = loaded, 100_000
-    if len(loaded.time_s) > many:
-        # what lies between two time steps of the model, of 1 s, says nothing to it
-        record = loaded.averaged(max(1.0, float(loaded.time_s[-1] - loaded.time_s[0]) / many))
+    record = loaded
+    if len(loaded.time_s) > _MANY_SAMPLES:
+        record = loaded.averaged(max(_MODEL_STEP_S, float(loaded.time_s[-1] - loaded.time_s[0]) / _MANY_SAMPLES))
     cell, fitted = _cell_at_the_temperature(record, settings), record
     if not settings.thermal:
         # one that is held counts more than one that was measured
@@ -237,7 +247,7 @@ def _estimate(
 def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Estimate:
     """Without numbers where the search ended at its bound, as for a cell of far another size: a bound is no result."""
     low_C, high_C = settings.q_mobile_bounds_C
-    near = 1.0 - 1e-3  # to a bound: the search ended at it
+    near = 1.0 - _AT_BOUND
     if low_C < near * estimate.q_mobile < near**2 * high_C:
         return estimate
     nothing: dict[str, Any] = dict.fromkeys(("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"), float("nan"))
@@ -316,8 +326,7 @@ def _middle(values: FloatArray, estimate: Estimate) -> tuple[float, float]:
     The median of samples, and the standard deviation that nine of ten of them show, if the estimate states one.
     """
     low, median, high = np.where(np.isfinite(values := quantile(values)), values, np.nan).tolist()
-    # within 1.645 standard deviations, if they are of a normal distribution
-    return median, (high - low) / (2.0 * 1.645) if np.isfinite(estimate.sd_q_mobile) else float("nan")
+    return median, (high - low) / (2.0 * _BAND_SD) if np.isfinite(estimate.sd_q_mobile) else float("nan")
 
 
 def _charge(part: _LoadedPart, settings: Settings, estimate: Estimate, end: Forecast | None) -> dict[str, float]:
@@ -359,7 +368,7 @@ def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cu
         return 0.0
     until_C, in_all_C = drawn(discharge.time_s, discharge.current_A, [eod_time_s, discharge.time_s[-1]]).tolist()
     more_C = in_all_C - until_C
-    if more_C <= 0.2 * until_C:
+    if more_C <= _MORE_SHARE * until_C:
         return 0.0
     warnings.warn(
         f"{more_C / 3600.0:.3f} Ah more are drawn after the cut-off at {eod_time_s:.0f} s, and left aside. If that is "

@@ -26,6 +26,15 @@ from battery_env.records.model import RECENT_SHARE, RecordModel
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# The last voltage of a record may be the cut-off but for rounding, V.
+_ROUNDING_V = 1e-6
+# The capacity of a new cell under a random load is the mean of so many draws, which makes it sure to 1 %.
+_NOMINAL_DRAWS = 100
+# An estimate this many standard deviations below what the record takes out of the cell contradicts the record.
+_CONTRADICTION_SD = 5.0
+# A figure goes on for at most this many times the record, or its expected end.
+_LONGEST_SHOWN = 1.5
+
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
@@ -120,7 +129,7 @@ class Forecast:
         time_s, voltage_V, end_s = self.time_s, self.voltage_V, self.eod_quantile_s()
         if np.isfinite(end_s).all():
             # an end that may be far away would leave no room for what was seen
-            last_s = min(end_s[2], 1.5 * max(self.now_s, end_s[1]))
+            last_s = min(end_s[2], _LONGEST_SHOWN * max(self.now_s, end_s[1]))
             axes.axvspan(min(end_s[0], last_s), last_s, color=COLOURS[1], alpha=0.2, lw=0, label=f"end of discharge, {inside}")
             axes.axvline(end_s[1], color=COLOURS[1], lw=1.2)
             time_s, voltage_V = time_s[time_s <= last_s], voltage_V[:, time_s <= last_s]
@@ -208,7 +217,7 @@ def forecast(
     else:
         cells = now.draws(samples, rng)._replace(drift_V=mismatch_V * rng.standard_normal(samples))
         r_ohm, voltage_V = cells.r_o, np.asarray(voltage(cells.state, cells.q_mobile, now.cell))
-    reached_V = cut_off + 1e-6  # but for rounding
+    reached_V = cut_off + _ROUNDING_V
     over = seen.voltage_V[-1] <= reached_V and seen.current_A[-1] > 0.0
     if not over:
         alive = np.flatnonzero(voltage_V + cells.error_V > cut_off)
@@ -235,7 +244,7 @@ def forecast(
     if nominal_Ah is None:
         # the mean over loads, sure to 1 %: under a single draw, health would be a matter of that draw. No charge takes a cell
         # to its end
-        given_Ah = new.capacity_Ah(draws[:100], cut_off)
+        given_Ah = new.capacity_Ah(draws[:_NOMINAL_DRAWS], cut_off)
         nominal_Ah = float(given_Ah[given_Ah > 0.0].mean()) if (given_Ah > 0.0).any() else float("nan")
     return Forecast(
         record=seen,
@@ -332,7 +341,7 @@ def _draw_parameters(
         raise ValueError(f"standard deviations must be at least 0, got {estimate!r}")
     least_C = max(model.least_q_mobile_C(current_A), Q_MOBILE.limits[0])
     low, high = np.log([least_C / q_C, Q_MOBILE.limits[1] / q_C])
-    if low > 5.0 * share:  # standard deviations of its logarithm
+    if low > _CONTRADICTION_SD * share:
         raise ValueError(
             f"the estimate contradicts the record, which takes a q_mobile of at least {least_C:.6g} C: got {q_C:.6g} +- "
             f"{share * q_C:.3g} C. Estimate anew from this record."

@@ -31,6 +31,8 @@ from battery_env.records.discharge import Discharge
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
 _COLUMNS = "cycle q_mobile_C sd_q_mobile_C r_o_ohm settled reason valid capacity_Ah mean_current_A lasted_share".split()
+# Lives that are simulated, and discharges to look ahead.
+_LIVES, _MOST = 2000, 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,13 +138,12 @@ class Life:
         rng = np.random.default_rng(0)
         (level_mean, drift_mean), ((p_level, p_both), (_, p_drift)) = self.state, self.covariance
         drift_sd = sqrt(p_drift)
-        lives = 2000
-        drift = drift_mean + drift_sd * truncnorm.rvs(-np.inf, -drift_mean / drift_sd, size=lives, random_state=rng)
+        drift = drift_mean + drift_sd * truncnorm.rvs(-np.inf, -drift_mean / drift_sd, size=_LIVES, random_state=rng)
         level = level_mean + p_both / p_drift * (drift - drift_mean)
-        level += sqrt(max(p_level - p_both**2 / p_drift, 0.0)) * rng.standard_normal(lives)
-        left = np.full(lives, np.inf)
-        for n in range(1, 2001):
-            level = level + drift + self.step_share * rng.standard_normal(lives)
+        level += sqrt(max(p_level - p_both**2 / p_drift, 0.0)) * rng.standard_normal(_LIVES)
+        left = np.full(_LIVES, np.inf)
+        for n in range(1, _MOST + 1):
+            level = level + drift + self.step_share * rng.standard_normal(_LIVES)
             left[np.isinf(left) & (level < end)] = n
         return quantile(left, probability)
 

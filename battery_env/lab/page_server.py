@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+# Ports that are tried, one after the other.
+_PORTS = 100
 # The program that removes a folder as soon as the process that started it is gone.
 _REMOVE = """\
 import shutil, signal, sys
@@ -34,7 +36,7 @@ def temporary_files_that_go() -> Iterator[None]:
 
 def free_port(first: int, host: str) -> int:
     """The first port from one on that no other program has."""
-    for port in range(first, min(first + 100, 1 << 16)):
+    for port in range(first, min(first + _PORTS, 1 << 16)):
         try:
             socket.create_server((host, port)).close()
         except OSError:

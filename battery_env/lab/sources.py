@@ -21,6 +21,8 @@ _RESULT_HEADS = (b"record,source,cell,cycle,", b"time_s,voltage_V,current_A,mode
 _NASA_SUFFIX = ".mat"
 # What NASA's discharges have beside them, in the layout of the bundled ones, is a table of tests and no record.
 _NO_RECORDS = ("cycles.csv",)
+# So many files are named where many are meant.
+_MOST_NAMED = 10
 # How what workbooks take for a formula begins.
 _FORMULA_HEADS = ("=", "+", "-", "@")
 
@@ -105,7 +107,7 @@ def _records(folder: Path) -> list[Path]:
 
 def few_of(names: Sequence[str]) -> str:
     """The first of many names."""
-    return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else "")
 
 
 def _by_number(path: Path) -> tuple[list[list[str | int]], Path]:

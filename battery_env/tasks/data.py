@@ -19,6 +19,12 @@ _Discharges = TypeVar("_Discharges")
 LoadKind = Literal["paper", "constant", "piecewise", "random_walk"]
 Split = Literal["train", "test", "all"]
 
+#: Discharges in a data set, but for the paper's.
+DISCHARGES = 1000
+#: Seed of ages, loads and of the division into train and test: all data sets of a parameter hold the same cells.
+SEED = 0
+TEST_SHARE = 0.3
+
 #: Ages of the cells that discharge under other loads than the paper's, C and ohm.
 Q_MOBILE_RANGE_C = (4000.0, 7600.0)
 R_O_RANGE_OHM = (0.1, 0.3)
@@ -80,17 +86,16 @@ def _splits(
     cell: CellParameters,
     path: AgingPath | None,
 ) -> dict[Split, TrajectoryDataset]:
-    count, seed = 1000, 0  # of ages, loads and the division: all data sets of a parameter hold the same cells
     if path is not None:
-        whole = TrajectoryDataset.along(path, count, _loads(load), seed, dt_s)
+        whole = TrajectoryDataset.along(path, DISCHARGES, _loads(load), SEED, dt_s)
     elif load == "paper" and len(parameters) == 1 and dt_s == 1.0 and mismatch == 0.0 and cell == NEW_CELL:
         whole = TrajectoryDataset.paper(parameters[0])
     else:
         ranges = PAPER_RANGES if load == "paper" else {"q_mobile": Q_MOBILE_RANGE_C, "r_o": R_O_RANGE_OHM}
         q_C, r_ohm, loads = ranges["q_mobile"], ranges["r_o"], _loads(load)
-        whole = TrajectoryDataset.generate(parameters, count, loads, seed, q_C, r_ohm, dt_s, cell=cell, mismatch=mismatch)
+        whole = TrajectoryDataset.generate(parameters, DISCHARGES, loads, SEED, q_C, r_ohm, dt_s, cell=cell, mismatch=mismatch)
         whole = whole.trimmed(*PAPER_TRIM) if load == "paper" else whole
-    train, test = whole.split(test=0.3, seed=seed)
+    train, test = whole.split(test=TEST_SHARE, seed=SEED)
     return {"train": train, "test": test, "all": whole}
 
 

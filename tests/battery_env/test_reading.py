@@ -346,6 +346,12 @@ def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter)
     assert read(pd.DataFrame(columns)).charge_C == pytest.approx(charge_C[-1], rel=0.02)
 
 
+def test_words_that_contradict_the_voltage_are_refused():
+    words = np.where(CYCLE["current"] > 0.0, "Discharge", "Charge")
+    with pytest.raises(ValueError, match=r"contradict each other \(1\.00, -1\.00\)"):
+        read_discharges(CYCLE.assign(state=words))
+
+
 def test_what_is_left_aside_is_named_and_a_mistake_in_some_cycles_loses_no_other():
     cycle = CYCLE.assign(Cycle=1, current=10.0 * CYCLE["current"])
     small = cycle.assign(current=0.005 * cycle["current"], time=cycle["time"] + 9000.0, Cycle=2)

@@ -10,8 +10,10 @@ from battery_env.records import LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE, switch
 
 #: What changes the voltage by more than this share of its range is much.
 MUCH_SHARE = 0.25
-# How plain the sign of the current must be, of -1 to 1; what changes the voltage by less says nothing, V.
-_CLEAR, _LEAST_V = 0.5, 1e-3
+# How plain the sign of the current must be, of -1 to 1.
+_CLEAR = 0.5
+# What changes the voltage by less says nothing, V.
+_LEAST_V = 1e-3
 
 
 def with_signed_current(rows: pd.DataFrame, known: Recognised, is_negative: bool | None) -> pd.DataFrame:
@@ -29,13 +31,16 @@ def with_signed_current(rows: pd.DataFrame, known: Recognised, is_negative: bool
             return rows.assign(current=current_A.abs().mask(towards < 0.0, -current_A.abs()))
         _refuse_unsigned(rows)
     if is_negative is None:
-        evidence = float(np.sign(current_A * towards).sum() / max((towards * flows).abs().sum(), 1.0)) or _jumps(rows)
-        is_negative = known.tester.discharge_is_negative if abs(evidence) <= _CLEAR else evidence < 0.0
-        if is_negative is None:
+        said = (towards != 0.0) & flows
+        words = float(np.sign(current_A * towards)[said].mean()) if said.any() else 0.0
+        jumps = _jumps(rows)
+        clear = [each for each in (words, jumps) if abs(each) > _CLEAR]
+        is_negative = clear[0] < 0.0 if clear else known.tester.discharge_is_negative
+        if is_negative is None or min(clear, default=0.0) < 0.0 < max(clear, default=0.0):
             raise ValueError(
-                "whether the current of a discharge is positive or negative cannot be told, as the voltage does not say so "
-                f"clearly ({evidence:.2f}). State it: --discharge-is-negative or --discharge-is-positive (Python: "
-                "discharge_is_negative)"
+                "whether the current of a discharge is positive or negative cannot be told, as words and jumps of the voltage "
+                f"do not say so clearly, or contradict each other ({words:.2f}, {jumps:.2f}). State it: "
+                "--discharge-is-negative or --discharge-is-positive (Python: discharge_is_negative)"
             )
     return rows.assign(current=-current_A) if is_negative else rows
 
