@@ -42,7 +42,7 @@ demo: install  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some
 test: install  ## all tests but attacks
 	$(BIN)/python -m pytest -n 2 --dist worksteal  # neighbours share their fixtures, and no worker is idle in the end
 
-test-attacks: install  ## attacks: sweeps over faults, their sizes and places, and what trains long
+test-attacks: install  ## attacks: sweeps over faults, their sizes and places, studies, and what trains long
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m attacks
 
 test-browser: install  ## the page for the bench in Chromium, which must be there; PICTURES=FOLDER keeps what is seen

@@ -89,6 +89,13 @@ def run_briefly(source, name, folder, monkeypatch):
     exec(compile(source, name, "exec"), {"__name__": "__main__"})
 
 
+def tried(files):
+    """Files with examples. Those that train are tried with the attacks, but for README."""
+    attacks = [pytest.mark.attacks]
+    trains = {file: ".learn(" in file.read_text(encoding="utf-8") and file.name != "README.md" for file in files}
+    return [pytest.param(file, marks=attacks if trains[file] else [], id=file.name) for file in files]
+
+
 #: Lines of output that a training of some steps does not reach
 LEARNED = r"HOLDS|NOT SHOWN|  decreases "
 
@@ -98,7 +105,7 @@ def form(line):
     return " ".join(re.sub(r"\d[\d.e+-]*", "#", line).split())
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", tried([page for page in PAGES if blocks(page, "python")]))
 def test_examples_in_pages_run_and_print_what_they_show(page, tmp_path, monkeypatch, capsys):
     for source in examples(page):
         run_briefly(source, str(page), tmp_path, monkeypatch)
@@ -112,7 +119,7 @@ def test_examples_in_pages_run_and_print_what_they_show(page, tmp_path, monkeypa
             assert text in printed
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
+@pytest.mark.parametrize("example", tried(EXAMPLES))
 def test_example_files_run(example, tmp_path, monkeypatch):
     for package in OPTIONAL.get(example.name, ()):
         pytest.importorskip(package)

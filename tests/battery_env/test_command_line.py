@@ -384,6 +384,7 @@ def one_after_the_other(fleet):
 
 
 @pytest.mark.parametrize("where", sweep("processes", "cluster"))
+@pytest.mark.attacks
 def test_a_fleet_side_by_side_is_the_same_as_one_after_the_other(where, fleet, one_after_the_other, request):
     chosen = ["--jobs", "2"]
     if where == "cluster":

@@ -87,6 +87,7 @@ def undisturbed(lab, tmp_path_factory):
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="it looks for processes as Linux has them")
 @pytest.mark.parametrize("end", sweep(signal.SIGTERM, signal.SIGKILL, "worker"))
+@pytest.mark.attacks
 def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed, tmp_path, capsys):
     arguments = (lab, "--out", tmp_path, "--table-only", "--jobs", 2)
     process = started(*arguments)

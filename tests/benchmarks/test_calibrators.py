@@ -52,6 +52,7 @@ class TestWork:
         assert len(counts["mismatch"]) == 4 * 6
 
 
+@pytest.mark.attacks
 def test_peers_are_as_good_as_they_can_be_until_a_sensor_is_wrong(tmp_path, monkeypatch, capsys):
     names = ("closed form", "least squares, whole discharge", "extended Kalman filter")
     among(monkeypatch, "peers", slice(0, 6, 3), names)
@@ -74,6 +75,7 @@ def test_a_wrong_current_goes_into_both_parameters(tmp_path, monkeypatch):
     assert error["Kalman filter", "none", "q_mobile"] < 0.5 < error["Kalman filter", "current +1 %", "q_mobile"] < 3.0
 
 
+@pytest.mark.attacks
 def test_the_policy_that_comes_with_the_package_says_which_it_is(tmp_path, monkeypatch):
     among(monkeypatch, "mismatch", slice(2, 3), ("LAC, pretrained",))
     results, text = make(tmp_path, "mismatch", "--discharges", "2")
@@ -81,6 +83,7 @@ def test_the_policy_that_comes_with_the_package_says_which_it_is(tmp_path, monke
     assert "| LAC, pretrained |" in text
 
 
+@pytest.mark.attacks
 def test_nuisance_constants_make_up_for_those_that_are_off(tmp_path, monkeypatch):
     among(monkeypatch, "mismatch", slice(2, 3), ("least squares, two parameters", "least squares, nuisances, offset"))
     results, _ = make(tmp_path, "mismatch", "--discharges", "2")

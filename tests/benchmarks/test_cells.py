@@ -3,6 +3,7 @@
 import json
 
 import pandas as pd
+import pytest
 
 from battery_env import load_nasa_discharges
 from benchmarks import cells
@@ -12,6 +13,7 @@ def configuration(file):
     return json.loads(file.read_text())["configuration"]
 
 
+@pytest.mark.attacks
 def test_over_the_life_of_a_cell_q_mobile_follows_its_capacity(tmp_path, capsys, monkeypatch):
     records = load_nasa_discharges("B0005")
     monkeypatch.setattr(cells, "load_nasa_discharges", lambda cell: [records[n] for n in (0, 60, 120, 167)])
@@ -28,6 +30,7 @@ def test_over_the_life_of_a_cell_q_mobile_follows_its_capacity(tmp_path, capsys,
     assert "| B0005" in capsys.readouterr().out
 
 
+@pytest.mark.attacks
 def test_fitted_constants_are_better_on_the_other_cell(tmp_path):
     cells.main(["fit_cell", "--every", "60", "--jobs", "1", "--out", str(tmp_path)])
     scores = pd.read_csv(tmp_path / "discharges.csv")

@@ -57,6 +57,7 @@ def test_cells_are_counted_where_lac_is_ahead_or_level_with_those_that_saw_the_s
     ]
 
 
+@pytest.mark.attacks
 def test_the_study_trains_and_writes(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(changing_plant, "EPISODES", 2)
     monkeypatch.setattr(changing_plant, "_CURVE_EPISODES", 2)

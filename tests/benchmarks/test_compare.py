@@ -67,6 +67,7 @@ def command(*others):
     return ["--envs", ENV_ID, "--evaluations", "2", "--jobs", "1", "--out", "out", *others]
 
 
+@pytest.mark.attacks
 def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     compare.main(command())
     out = tmp_path / "out"
@@ -184,6 +185,7 @@ def test_defaults_are_the_line_as_typed(algo, tmp_path, monkeypatch):
         assert th.equal(ours, expected)
 
 
+@pytest.mark.attacks
 def test_an_interrupted_run_goes_on_from_its_checkpoint_and_says_so(tmp_path, monkeypatch):
     started_at = []
 
@@ -221,6 +223,7 @@ BatteryVoltageJoint-v0: {policy: MlpPolicy, n_timesteps: 96, n_envs: 16, learnin
 """
 
 
+@pytest.mark.attacks
 def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_path, capsys):
     for algo in ("lac", "sac"):
         (tmp_path / "zoo_configs" / f"{algo}.yml").write_text(VOLTAGE_CONFIG)
@@ -249,6 +252,7 @@ def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_pa
     assert {path: path.stat().st_mtime_ns for path in times} == times
 
 
+@pytest.mark.attacks
 def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_path, capsys, monkeypatch):
     pages = [(ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("own_problem.md", "own_algorithm.md")]
     environment, algorithm = (re.search(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)[1] for page in pages)

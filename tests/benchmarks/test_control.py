@@ -106,6 +106,7 @@ def quick(monkeypatch, train_nothing):
     return train_nothing(stabilisation)
 
 
+@pytest.mark.attacks
 def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys):
     command = ["--envs", "LinearCost-v0", "--algos", "lac", "--timesteps", "20000", "--episodes", "3"]
     command += ["--certificate-episodes", "25", "--jobs", "1", "--out", str(tmp_path)]
@@ -142,6 +143,7 @@ def test_without_a_number_of_steps_it_is_that_of_the_zoo():
     assert reference["timesteps"] is None and [each["timesteps"] for each in parts] == [60_000, 60_000]
 
 
+@pytest.mark.attacks
 def test_controllers_are_judged_without_training_and_weak_ones_leave_the_goal(tmp_path, quick):
     command = ["--envs", "LinearCost-v0", "--algos", "--weak-controllers", "--episodes", "3", "--jobs", "1"]
     stabilisation.main([*command, "--certificate-episodes", "25", "--out", str(tmp_path)])

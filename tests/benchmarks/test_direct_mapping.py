@@ -98,6 +98,7 @@ class TestDirectMapping:
         assert errors[1] == errors[2] < 0.2 * guess and errors[1] < errors[0]
 
 
+@pytest.mark.attacks
 def test_the_study_compares_all_on_each_division(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(direct_mapping, "train_or_load", lambda *arguments: Always(0.0))
     monkeypatch.setattr(direct_mapping, "TEST_DISCHARGES", 4)

@@ -1,11 +1,13 @@
 """The study of forecasts, on a few discharges."""
 
 import pandas as pd
+import pytest
 
 from battery_env.records.discharge import load_nasa_discharges
 from benchmarks import forecasts
 
 
+@pytest.mark.attacks
 def test_the_study_writes_its_tables(monkeypatch, tmp_path, capsys):
     records = load_nasa_discharges("B0005")[:2]
     monkeypatch.setattr(forecasts, "load_nasa_discharges", lambda cell: records)
@@ -29,6 +31,7 @@ def test_published_intervals_of_nine_of_ten_hold_where_life_and_load_are_known()
     assert rows[rows["load"] == "2 A"]["width_percent"].max() < 10.0 and rows["width_percent"].median() < 15.0
 
 
+@pytest.mark.attacks
 def test_the_life_that_remains_is_compared_with_the_measured_one(tmp_path):
     published = pd.read_csv("docs/results/real_cells/discharges.csv")
     # the second half of its life

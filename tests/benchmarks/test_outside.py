@@ -54,6 +54,7 @@ def test_tasks_are_aggregated_by_the_probability_alone():
     assert of_all["probability"] == 0.5 and np.isnan(of_all["difference"])
 
 
+@pytest.mark.attacks
 def test_the_study_trains_writes_and_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(outside, "EPISODES", 2)
     out, command = tmp_path / "rows", ["--tasks", "Pendulum-v1", "--algos", "lac", "sac", "--timesteps", "40", "--jobs", "1"]

@@ -1,10 +1,12 @@
 """The study of what both parameters are, on a few discharges."""
 
 import pandas as pd
+import pytest
 
 from benchmarks import parameters
 
 
+@pytest.mark.attacks
 def test_the_study_compares_estimates_with_what_was_measured(tmp_path, capsys):
     parameters.main(["--cells", "B0006", "--every", "167", "--out", str(tmp_path)])
     rows = pd.read_csv(tmp_path / "resistances.csv")

@@ -15,6 +15,7 @@ from benchmarks.two_rate_sac import TwoRateSAC
 from sb3_lac.envs import reference_controller
 
 
+@pytest.mark.attacks
 def test_trained_policies_are_judged(tmp_path, monkeypatch, train_nothing, capsys):
     asked = train_nothing(stabilisation)
     # the last of each disturbance

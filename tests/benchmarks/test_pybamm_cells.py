@@ -17,6 +17,7 @@ def life(name, seed):
     return SimulatedLife([Discharge(each.time_s[::5], each.voltage_V[::5], each.current_A[::5]) for each in made], 2.7)
 
 
+@pytest.mark.attacks
 def test_what_is_known_of_a_cell_brings_its_end_nearer(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(pybamm_cells, "simulated", life)
     monkeypatch.setattr(pybamm_cells, "DISCHARGES", 12)

@@ -59,6 +59,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("kind", ["sb3_lac:LAC", "stable_baselines3:SAC"])
+@pytest.mark.attacks
 def test_a_training_that_was_killed_goes_on_from_its_checkpoint(trainer, monkeypatch, kind):
     monkeypatch.setattr(runs, "CHECKPOINT_EVERY_S", 0.0)
     run, judged = replace(RUN, kind=kind), []
@@ -136,6 +137,7 @@ def test_tables_of_two_machines_are_one_and_the_first_row_of_a_training_stays(tm
     assert Rows(tmp_path / "none.csv").of(wanted).empty
 
 
+@pytest.mark.attacks
 def test_rows_can_be_made_without_the_rl_zoo():
     hide = "import sys; sys.modules.update(dict.fromkeys(('rl_zoo3', 'progpy', 'mujoco', 'sb3_contrib')))"
     code = f"{hide}; import benchmarks.outside as o; o.run_of('Pendulum-v1', 'lac_common', 1).key"

@@ -40,6 +40,7 @@ def test_contestants_take_turns_in_alternating_order():
     pd.testing.assert_frame_equal(speeds, pd.DataFrame({"LAC": [4.0] * 4, "SAC": [2.0] * 4, "TD3": [8.0] * 4}))
 
 
+@pytest.mark.attacks
 def test_filters_are_raced_and_written(monkeypatch, tmp_path, capsys):
     pytest.importorskip("progpy")
     pytest.importorskip("onnxruntime")

@@ -117,6 +117,7 @@ def test_a_call_that_fails_stops_no_other(tmp_path, capsys):
     assert kept == {1: 1.0} and "part 1 of 2 failed: ZeroDivisionError" in capsys.readouterr().err
 
 
+@pytest.mark.attacks
 def test_a_lost_process_costs_a_study_nothing_and_one_that_is_lost_twice_its_part_alone(tmp_path, capsys):
     kept, chosen, calls = {}, a_study(tmp_path, jobs=2), [(n, tmp_path) for n in range(3)]
     with pytest.raises(BrokenExecutor):

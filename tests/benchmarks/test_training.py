@@ -162,6 +162,7 @@ def test_beside_a_model_stands_what_made_it(tmp_path):
     assert record["training_minutes"] > 0 and "torch" in record["versions"]
 
 
+@pytest.mark.attacks
 def test_compilation_is_no_part_of_the_recipe(tmp_path, monkeypatch, trainings):
     monkeypatch.setattr(compiled, "BACKEND", "eager")
     model = train(25, tmp_path, compile_update=True)

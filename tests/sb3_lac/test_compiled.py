@@ -140,6 +140,7 @@ def test_a_rate_that_has_fallen_to_zero_changes_nothing(make_model):
     assert all(th.equal(*parameters) for parameters in zip(before, after, strict=True))
 
 
+@pytest.mark.attacks
 def test_constants_may_change(make_model):
     models = [make_model(compile_update=compile_update, target_update_interval=2) for compile_update in (False, True)]
     for model in models:
@@ -152,6 +153,7 @@ def test_constants_may_change(make_model):
     assert_close(*models)
 
 
+@pytest.mark.attacks
 def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
     """CUDA graphs change tensors where they are, but no samples, need no value on the CPU, and have one output."""
     from torch._dynamo.backends.common import aot_autograd  # seconds, which others that are tested here do without
@@ -183,6 +185,7 @@ def test_graph_is_one_that_a_gpu_can_replay(make_model, monkeypatch):
     assert not any("local_scalar_dense" in str(node.target) for node in graph.nodes)
 
 
+@pytest.mark.attacks
 def test_saved_models_go_on_compiled_or_not(make_model, tmp_path):
     model, _ = trained(make_model(compile_update=True, **SCHEDULES), calls=1)
     model.save(tmp_path / "compiled")
@@ -206,6 +209,7 @@ def test_any_replay_buffer_and_vec_normalize(make_model, n_updates):
     assert n_updates(model) == 6 and th.isfinite(model.log_lambda).all()
 
 
+@pytest.mark.attacks
 def test_what_is_constant_is_looked_at_once_a_call_and_compilation_is_said(make_model, monkeypatch, capsys):
     looks = []
     again = compiled.Graph.again
