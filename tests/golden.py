@@ -42,7 +42,7 @@ COST_IDS = ("CartPoleCost-v0", "Oscillator-v0", "LinearCost-v0")
 
 
 def model() -> Numbers:
-    """Trajectories of the model, and of the standard data sets."""
+    """Trajectories of the model."""
     for name, arguments in {
         "power": {"load": 8.0, "load_unit": "power"},
         "current": {"load": 2.0, "load_unit": "current"},
@@ -51,14 +51,6 @@ def model() -> Numbers:
         trajectory = simulate(q_mobile=6000.0, r_o=0.15, dt=1.0, **arguments)
         yield f"model/{name}/state", trajectory.state
         yield f"model/{name}/voltage", trajectory.voltage_V
-    for aged, load in (("q_mobile", "paper"), ("r_o", "constant"), ("joint", "random_walk"), ("joint", "piecewise")):
-        dataset = standard_dataset(("q_mobile", "r_o") if aged == "joint" else aged, load, "test")
-        for n in (0, len(dataset) // 2, len(dataset) - 1):
-            record = dataset[n]
-            yield f"dataset/{aged}/{load}/{n}", np.column_stack(
-                [record.time_s, record.voltage_V, record.current_A, record.load]
-            )
-            yield f"dataset/{aged}/{load}/{n}/state", record.state
 
 
 def tasks() -> Numbers:
@@ -90,21 +82,16 @@ def calibrators() -> Numbers:
     """Estimates of every calibrator, on simulated and on recorded discharges."""
     paper, drive = standard_dataset("q_mobile", "paper", "test"), standard_dataset(("q_mobile", "r_o"), "random_walk", "test")
     of_paper, of_drive = paper.subset([5, 900]), drive.subset([1, 7])
-    errors = SensorErrors(noise_V=0.005)
+    errors = SensorErrors(noise_V=0.005, offset_V=0.01)
+    estimators = {"least_squares": LeastSquares(), "kalman": ExtendedKalmanFilter(), "policy": PolicyEstimator.pretrained()}
     for k, trace in enumerate(ClosedForm().trace(of_paper)):
         yield f"closed_form/{k}", np.column_stack([trace.time_s, trace.q_mobile, trace.r_o])
-    for name, estimator in {"least_squares": LeastSquares(), "kalman": ExtendedKalmanFilter()}.items():
+    for name, estimator in estimators.items():
         frame = evaluate(estimator, of_drive, errors, seed=1).drop(columns="time_per_update_s")
         yield f"{name}/evaluate", frame.select_dtypes("number").to_numpy(dtype=float)
     yield "cramer_rao", np.array(list(vars(cramer_rao_bound(of_drive[0], 0.005)).values()), dtype=object).astype(str)
     frame = evaluate(ExtendedKalmanFilter(), of_drive, RandomSensorErrors((0.001, 0.03), 0.01), seed=2)
     yield "kalman/random_errors", frame.drop(columns="time_per_update_s").select_dtypes("number").to_numpy()
-    for cell in ("B0005", "B0006"):
-        record = load_nasa_discharges(cell)[40]
-        for name, estimator in {"least_squares": LeastSquares(), "kalman": ExtendedKalmanFilter()}.items():
-            for part, of_part in (("whole", record), ("half", record.until(0.5 * float(record.time_s[-1])))):
-                estimate = estimator.estimate(of_part)
-                yield f"{name}/{cell}/{part}", np.array([str(value) for value in vars(estimate).values()])
 
 
 def streams() -> Numbers:
@@ -156,7 +143,7 @@ def streams() -> Numbers:
 def fits() -> Numbers:
     """Least squares with every option, over lives, and the constants of a cell."""
     life = load_nasa_discharges("B0006")
-    record, errors = life[20], SensorErrors(noise_V=0.005, offset_V=0.01)
+    record = life[20]
     for name, options in {
         "thermal": {"thermal": True, "mismatch_V": 0.05},
         "prior": {"prior_q_mobile_C": (7000.0, 150.0), "mismatch_V": 0.05},
@@ -170,9 +157,6 @@ def fits() -> Numbers:
                 columns = (trace.time_s, trace.q_mobile, trace.r_o, trace.sd_q_mobile, trace.sd_r_o, trace.settled)
                 yield f"fit/{name}/{part}/{k}", np.column_stack(columns)
             yield f"fit/{name}/{part}/reason", np.array([LeastSquares(**options).estimate(of_part).reason])
-    drive = standard_dataset(("q_mobile", "r_o"), "random_walk", "test").subset([2, 11])
-    frame = evaluate(LeastSquares(), drive, errors, seed=1).drop(columns="time_per_update_s")
-    yield "fit/plain/evaluate", frame.select_dtypes("number").to_numpy(dtype=float)
     fitted = fit_cell([life[5], life[90]])
     with tempfile.TemporaryDirectory() as folder:
         fitted.to_json(Path(folder) / "cell.json")
@@ -210,19 +194,16 @@ def command_line() -> Numbers:
     walk = standard_dataset(("q_mobile", "r_o"), "random_walk", "test")[0]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        rows = zip(record.time_s, record.voltage_V, record.current_A, strict=True)
-        text = "Time [s];Voltage [mV];Current [mA]\n" + "".join(f"{t};{1e3 * v};{-1e3 * i}\n" for t, v, i in rows)
-        (folder / "milli.csv").write_text(text, encoding="utf-8")
-        rows = zip(walk.time_s[::5] / 60.0, walk.voltage_V[::5], walk.current_A[::5], strict=True)
-        text = "time_min,voltage_V,current_A\n" + "".join(f"{t},{v},{i}\n" for t, v, i in rows)
-        (folder / "walk.csv").write_text(text, encoding="utf-8")
-        half = f"{0.5 * float(record.time_s[-1])}"
-        until = "Test Time (s),Voltage (V),Current (A)\n" + "".join(
-            f"{t},{v},{i}\n"
-            for t, v, i in zip(record.time_s, record.voltage_V, record.current_A, strict=True)
-            if t < float(half)
+
+        def write(file: str, header: str, *columns: np.ndarray) -> None:
+            np.savetxt(folder / file, np.column_stack(columns), "%.17g", ",", header=header, comments="")
+
+        half = record.until(0.5 * float(record.time_s[-1]))
+        write(
+            "milli.csv", "Time [s],Voltage [mV],Current [mA]", record.time_s, 1e3 * record.voltage_V, -1e3 * record.current_A
         )
-        (folder / "half.csv").write_text(until, encoding="utf-8")
+        write("walk.csv", "time_min,voltage_V,current_A", walk.time_s / 60.0, walk.voltage_V, walk.current_A)
+        write("half.csv", "Test Time (s),Voltage (V),Current (A)", half.time_s, half.voltage_V, half.current_A)
         (folder / "odd.csv").write_text("time,voltage\n0,4\n1,3.9\n", encoding="utf-8")
         for k, discharge in enumerate(read_discharges(folder / "milli.csv")):
             yield f"read/{k}", np.column_stack([discharge.time_s, discharge.voltage_V, discharge.current_A])
@@ -257,14 +238,6 @@ def command_line() -> Numbers:
                         yield f"{key}/{k}/{column}", np.array([repr(value)])
 
 
-def policies() -> Numbers:
-    """What the policies that come with the package estimate."""
-    drive = standard_dataset(("q_mobile", "r_o"), "piecewise", "test").subset([2, 9])
-    scores = evaluate(PolicyEstimator.pretrained(), drive, SensorErrors(noise_V=0.005), seed=1)
-    numbers = scores.drop(columns="time_per_update_s").select_dtypes("number")
-    yield "policy/BatteryVoltageJoint-v0", numbers.to_numpy(dtype=float)
-
-
 def certificates() -> Numbers:
     """Reference controllers, a policy that is too short trained, and what is said of both."""
     th.set_num_threads(1)
@@ -288,46 +261,35 @@ def certificates() -> Numbers:
         yield f"certificate/{name}/{env_id}/bounds", np.array(values, dtype=float)
 
 
-def lac_trainings() -> Numbers:
-    """Weights of LAC after short trainings with each of its variants."""
-    th.set_num_threads(1)
-    for name, env_id, arguments in (
-        ("compiled", "LinearCost-v0", {"compile_update": True}),
-        ("n_steps", "Pendulum-v1", {"n_steps": 3, "ent_coef": 0.1}),
-        ("gsde", "Pendulum-v1", {"use_sde": True, "train_freq": 8, "gradient_steps": 4}),
-        ("two_critics", "CartPoleCost-v0", {"policy_kwargs": {"n_critics": 2, "net_arch": [32, 32]}, "lambda_max": 5.0}),
-        ("bound", "Pendulum-v1", {"reward_bound": 2.0, "alpha3": 0.3, "gamma": 0.9}),
-    ):
-        model = LAC("MlpPolicy", env_id, seed=7, learning_starts=50, device="cpu", **arguments).learn(250)
-        for key, weights in model.policy.state_dict().items():
-            yield f"lac/{name}/{key}", weights.numpy()
-
-
 def trainings() -> Numbers:
-    """Weights after short trainings, what the policies estimate, and how their certificate is judged."""
+    """Weights after short trainings, with each variant of LAC, what the policies estimate, and how a critic is judged."""
     th.set_num_threads(1)
-    for algo, id_ in ((LAC, "BatteryQmax-v0"), (SAC, "BatteryVoltageJoint-v0"), (LAC, "LinearCost-v0"), (LAC, "Pendulum-v1")):
-        policy = algo("MlpPolicy", id_, seed=5, learning_starts=50, device="cpu")
-        policy.learn(300)
-        for name, weights in policy.policy.state_dict().items():
-            yield f"training/{algo.__name__}/{id_}/{name}", weights.numpy()
+    for name, algo, id_, arguments in (
+        ("default", LAC, "BatteryQmax-v0", {}),
+        ("default", SAC, "BatteryVoltageJoint-v0", {}),
+        ("compiled", LAC, "LinearCost-v0", {"compile_update": True}),
+        ("n_steps", LAC, "Pendulum-v1", {"n_steps": 3, "ent_coef": 0.1}),
+        ("gsde", LAC, "Pendulum-v1", {"use_sde": True, "train_freq": 8, "gradient_steps": 4}),
+        ("two_critics", LAC, "CartPoleCost-v0", {"policy_kwargs": {"n_critics": 2, "net_arch": [32, 32]}, "lambda_max": 5.0}),
+        ("bound", LAC, "Pendulum-v1", {"reward_bound": 2.0, "alpha3": 0.3, "gamma": 0.9}),
+    ):
+        model = algo("MlpPolicy", id_, seed=7, learning_starts=50, device="cpu", **arguments).learn(250)
+        for key, weights in model.policy.state_dict().items():
+            yield f"training/{id_}/{name}/{key}", weights.numpy()
         if id_.startswith("Battery"):
             aged, load = ("q_mobile", "paper") if id_ == "BatteryQmax-v0" else (("q_mobile", "r_o"), "piecewise")
             discharges = standard_dataset(aged, load, "test").subset([3, 4])
-            frame = evaluate(PolicyEstimator(policy, id_), discharges).drop(columns="time_per_update_s")
-            yield f"training/{algo.__name__}/{id_}/evaluate", frame.select_dtypes("number").to_numpy()
+            frame = evaluate(PolicyEstimator(model, id_), discharges).drop(columns="time_per_update_s")
+            yield f"training/{id_}/evaluate", frame.select_dtypes("number").to_numpy()
         if id_ == "LinearCost-v0":
-            report = evaluate_lyapunov(policy, gym.make(id_), n_eval_episodes=5, seed=0)
+            report = evaluate_lyapunov(model, gym.make(id_), n_eval_episodes=5, seed=0)
             for metric, interval in report.metrics.items():
                 yield f"evaluate_lyapunov/{metric}", np.array(interval)
 
 
 PARTS: dict[str, Callable[[], Numbers]] = {
     part.__name__: part
-    for part in (
-        *(model, tasks, calibrators, streams, fits, forecasts, command_line, policies),
-        *(trainings, lac_trainings, certificates),
-    )
+    for part in (model, tasks, calibrators, streams, fits, forecasts, command_line, trainings, certificates)
 }
 
 
