@@ -4,8 +4,8 @@ import json
 import warnings
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
-import pandas as pd
 import pytest
 
 from battery_env import AgingPath, LeastSquares, PolicyEstimator, TrajectoryDataset, calibrate, evaluate, fit_life
@@ -13,8 +13,6 @@ from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS, simulate
 from battery_env.electrochemistry.aging_path import PATH_NAMES, SPREAD_SD, cell_with
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.estimates import last_estimate
-from battery_env.lab.command_line import SETTLED
-from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.life import track_life
 from battery_env.lab.settings import Settings
 from battery_env.loads import RandomPiecewise, constant
@@ -26,6 +24,7 @@ from battery_env.sensors import SensorErrors
 from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES, VoltageTask
 from tests.policies import Always
 from tests.sweeps import sweep
+from tests.terminal import write
 
 AGES = 5
 LOAD = constant(2.0, "current")
@@ -148,20 +147,12 @@ class TestDataset:
         np.testing.assert_array_equal(again.equilibrium_V, data.equilibrium_V[[4, 2]])
 
     def test_the_tasks_draw_from_it(self, path):
-        import gymnasium as gym
-
         data = TrajectoryDataset.along(path, 4, [LOAD], seed=3)
         env = gym.make("BatteryVoltageJoint-v0", dataset=data, cost="state")
         observation, _ = env.reset(seed=0)
         assert np.isfinite(observation).all()
         _, reward, *_, info = env.step(env.action_space.sample())
         assert reward < 0.0 and info["q_mobile"] in data.q_mobile
-
-    def test_a_task_that_knows_one_equilibrium_voltage_refuses_it(self, path):
-        import gymnasium as gym
-
-        with pytest.raises(ValueError, match="constants of their own"):
-            gym.make("BatteryJoint-v0", dataset=TrajectoryDataset.along(path, 4, [LOAD], seed=3))
 
     def test_what_is_no_path_is_refused(self):
         with pytest.raises(TypeError, match="must be an AgingPath"):
@@ -214,7 +205,6 @@ class TestPrior:
     @pytest.mark.parametrize("share", sweep(1.0, 0.3))
     @pytest.mark.parametrize("size", sweep(2.8, 0.3, 1.0, 4.0, 10.0))
     def test_a_cell_of_any_size_has_an_answer_and_of_another_one_it_is_not_settled(self, b0006, size, share):
-        """Where to start was told from constants that draw less of a charge: the search began at no number."""
         made = simulate(2.0 * size, 6000.0 * size, 0.0, load_unit="current", cut_off_V=2.7)
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)
@@ -252,7 +242,7 @@ class TestPrior:
 class TestCalibrations:
     """The commands and their Python door, of which a path is the cell."""
 
-    def test_they_say_what_least_squares_say(self, b0006, tmp_path, capsys):
+    def test_they_say_what_least_squares_say(self, b0006, tmp_path, terminal):
         file, running = b0006.to_json(tmp_path / "path.json"), load_nasa_discharges("B0005")[80].until(1500.0)
         found = calibrate(running, cell=b0006)
         estimate = LeastSquares(path=b0006, current_gain_sd=0.005).estimate(running.loaded_part(2.7))
@@ -261,10 +251,7 @@ class TestCalibrations:
         assert found.voltage_rmse_V < 0.005 and found.method == "least-squares"
         measured_s = load_nasa_discharges("B0005")[80].eod_time_s(2.7)
         assert abs(found.predicted_eod_time_s - measured_s) < 1.64 * found.sd_predicted_eod_time_s
-        csv = tmp_path / "running.csv"
-        pd.DataFrame({name: getattr(running, name) for name in ("time_s", "voltage_V", "current_A")}).to_csv(csv, index=False)
-        assert command(["forecast", str(csv), "--cell", str(file), "--json"]) == SETTLED  # nothing contradicts it
-        told = json.loads(capsys.readouterr().out)
+        told = terminal.row("forecast", write(running, tmp_path / "running.csv"), "--cell", file)  # nothing contradicts it
         assert told["eod_time_s"][1] == pytest.approx(found.predicted_eod_time_s, rel=0.01)
 
     def test_a_gain_that_may_be_off_is_the_sensors_and_not_one_of_unlike_cells(self, b0006):

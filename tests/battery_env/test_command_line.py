@@ -1,4 +1,3 @@
-import json
 import shutil
 import subprocess
 import sys
@@ -23,18 +22,14 @@ from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.settings import SettingsOptions
 from battery_env.lab.sources import find_sources
 from battery_env.loads import constant
+from battery_env.records import Samples
 from tests.sweeps import sweep
+from tests.terminal import write
 
 
 @pytest.fixture(scope="module")
 def recorded() -> Discharge:
     return load_nasa_discharges("B0006")[99]
-
-
-def write(record: Discharge | Trajectory, path: Path, sign: float = 1.0) -> str:
-    columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": sign * record.current_A}
-    pd.DataFrame(columns).to_csv(path, index=False)
-    return str(path)
 
 
 def seen(record: Discharge | Trajectory, samples: slice) -> Discharge:
@@ -44,34 +39,6 @@ def seen(record: Discharge | Trajectory, samples: slice) -> Discharge:
 def names_in(folder: Path) -> set[str]:
     """Those that are shown, without the lock."""
     return {path.name for path in folder.iterdir() if not path.name.startswith(".")}
-
-
-class Terminal:
-    """``battery-calibrate`` with its arguments, and what it prints."""
-
-    def __init__(self, capsys: pytest.CaptureFixture):
-        self.capsys = capsys
-
-    def shows(self, *arguments: object, status: int = 0) -> str:
-        self.capsys.readouterr()
-        assert command([*map(str, arguments)]) == status
-        return self.capsys.readouterr().out
-
-    def row(self, *arguments: object, status: int = 0) -> dict:
-        return json.loads(self.shows(*arguments, "--json", status=status))
-
-    def refuses(self, *arguments: object) -> str:
-        self.capsys.readouterr()
-        assert command([*map(str, arguments)]) == 2
-        captured = self.capsys.readouterr()
-        assert captured.out == ""
-        assert captured.err.startswith("error: ") and captured.err.count("\n") == 1
-        return captured.err
-
-
-@pytest.fixture
-def terminal(capsys) -> Terminal:
-    return Terminal(capsys)
 
 
 def test_calibrates_a_bundled_discharge_and_writes_what_it_found(tmp_path, terminal):
@@ -411,7 +378,7 @@ def test_results_among_the_records_are_no_records(recorded, tmp_path, terminal):
 
 class TestInPython:
     def test_files_tables_and_discharges_say_the_same_as_on_the_command_line(self, recorded, tmp_path, terminal):
-        path = Path(write(recorded, tmp_path / "cell.csv", sign=-1.0))
+        path = Path(write(Samples(recorded.time_s, recorded.voltage_V, -recorded.current_A), tmp_path / "cell.csv"))
         row = terminal.row(path, "--nominal", 2, "--method", "kalman")
         options = {"nominal_Ah": 2.0, "method": "kalman"}
         (of_file,), (of_table,) = (battery_env.calibrate(each, **options) for each in (path, pd.read_csv(path)))

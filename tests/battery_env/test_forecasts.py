@@ -1,6 +1,5 @@
 """Forecasts are the model's where everything is known, and as wide as what is not known where it is not."""
 
-import json
 import re
 import sys
 from pathlib import Path
@@ -22,6 +21,7 @@ from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, cons
 from battery_env.records import Samples, resample_current
 from battery_env.records.discharge import Discharge
 from tests.sweeps import sweep
+from tests.terminal import write
 
 TRUTH = Estimate(6000.0, 0.15)
 # short discharges of few steps
@@ -328,14 +328,6 @@ class TestCommand:
         Path("lab/notes.txt").write_text("moved to channel 4")
         Path("profile.csv").write_text("time_s;current_A\n0;1.0\n600;3.0\n")
 
-    def row(self, capsys, *arguments, status=0):
-        capsys.readouterr()
-        assert calibrate(["forecast", *arguments, "--json"]) == status
-        return json.loads(capsys.readouterr().out)
-
-    def wide_sd_C(self, capsys):
-        return self.row(capsys, "running.csv", "--life", "lab", "--load", "profile.csv")["prior_q_mobile_C"][1]
-
     def test_two_cells_are_not_one_life_without_a_word(self, capsys):
         Path("other").mkdir()
         Path("lab/life.csv").rename("other/life.csv")
@@ -343,22 +335,13 @@ class TestCommand:
         assert calibrate(["forecast", "running.csv", "--life", "lab", "other"]) == 0
         assert "the records of lab, other are taken for one cell's" in capsys.readouterr().err
 
-    @pytest.mark.parametrize(
-        ("load", "message"),
-        [("time_s,current_A\n0,-1.0\n600,-3.0\n", "current_A is nowhere above 0"), ("", "profile.csv: no table")],
-    )
-    def test_a_load_that_draws_nothing_is_refused(self, capsys, load, message):
-        Path("profile.csv").write_text(load)
-        assert calibrate(["forecast", "running.csv", "--prior", "5460", "55", "--load", "profile.csv"]) == 2
-        assert message in capsys.readouterr().err
-
-    def test_life_and_load_give_the_end_that_python_gives(self, capsys):
+    def test_life_and_load_give_the_end_that_python_gives(self, capsys, terminal):
         Path("running.csv").rename("run_2.5A.csv")
         assert calibrate(["forecast", "run_2.5A.csv", "--life", "lab", "--load", "profile.csv", "--out", "out"]) == 0
         shown = capsys.readouterr()
         assert "life of 10 earlier discharges" in shown.out and "then a given load" in shown.out and "health" not in shown.out
         assert "notes.txt is left out" in shown.err
-        written = self.row(capsys, "run_2.5A.csv", "--life", "lab", "--load", "profile.csv")
+        written = terminal.row("forecast", "run_2.5A.csv", "--life", "lab", "--load", "profile.csv")
         life = track_life(self.discharges[:10], 2.7)
         # another load than that of the life
         assert written["prior_q_mobile_C"] == pytest.approx(life.prior_at_other_loads_C, rel=1e-6)
@@ -369,8 +352,8 @@ class TestCommand:
         # the charge that 2 A draw until the end, and what is over at once under 3 A
         assert written["eod_time_s"][1] < 1800.0 + (2.0 * (self.end_s - 1200.0) - 600.0) / 3.0
         assert Path("out/run_2.5A_forecast.png").read_bytes().startswith(b"\x89PNG")
-        assert calibrate(["forecast", "run_2.5A.csv", "--out", "out"]) == 2
-        assert "out/run_2.5A_forecast.png would be replaced" in capsys.readouterr().err
+        refused = terminal.refuses("forecast", "run_2.5A.csv", "--out", "out")
+        assert "out/run_2.5A_forecast.png would be replaced" in refused
 
     @pytest.mark.parametrize("size", sweep(0.3, 0.05, 2.5, 10.0, 100.0))
     @pytest.mark.parametrize("share", sweep(0.5, 0.25, 0.75))
@@ -405,70 +388,65 @@ class TestCommand:
         assert [life.prior_for(running, load) for load in loads] == list(loads.values())
         assert life.prior_for(running, read_load("profile.csv")) == life.prior_for(running, lambda time_s: 2.0) == other
 
-    def test_of_its_own_folder_only_what_came_before_counts(self, capsys):
+    def test_of_its_own_folder_only_what_came_before_counts(self, terminal):
         table = pd.read_csv("all.csv")
         Path("folder").mkdir()
         for number, cycle in table.groupby("cycle"):
             cycle.drop(columns="cycle").to_csv(f"folder/{number}.csv", index=False)
         table.query("cycle == 6 and time_s < 1200").drop(columns="cycle").to_csv("folder/6.csv", index=False)
-        assert self.row(capsys, "folder/6.csv", "--life", "folder")["life_discharges"] == 5
+        assert terminal.row("forecast", "folder/6.csv", "--life", "folder")["life_discharges"] == 5
 
-    def test_a_discharge_that_has_ended_is_not_forecast(self, capsys):
-        assert calibrate(["forecast", "lab/life.csv"]) == 2
-        assert "reaches 2.7 V at" in capsys.readouterr().err
-
-    def test_of_its_own_file_only_what_came_before_counts(self, capsys):
+    def test_of_its_own_file_only_what_came_before_counts(self, terminal):
         apart, together = (
-            self.row(capsys, *names) for names in (("running.csv", "--life", "lab"), ("all.csv", "--life", "all.csv"))
+            terminal.row("forecast", *names) for names in (("running.csv", "--life", "lab"), ("all.csv", "--life", "all.csv"))
         )
         assert together["record"] == "all_011" and together["life_discharges"] == 10
         assert together["eod_time_s"] == pytest.approx(apart["eod_time_s"], rel=1e-3)
         assert together["eod_time_s"][1] == pytest.approx(self.end_s, rel=0.02)
-        assert together["prior_q_mobile_C"][1] < 0.8 * self.wide_sd_C(capsys)
+        wide = terminal.row("forecast", "running.csv", "--life", "lab", "--load", "profile.csv")
+        assert together["prior_q_mobile_C"][1] < 0.8 * wide["prior_q_mobile_C"][1]
 
-    def test_without_a_life_the_interval_is_wide_and_the_filter_is_taken(self, capsys):
-        alone, carried = self.row(capsys, "running.csv"), self.row(capsys, "running.csv", "--prior", "5600", "60")
+    def test_without_a_life_the_interval_is_wide_and_the_filter_is_taken(self, terminal):
+        alone, carried = (terminal.row("forecast", "running.csv", *prior) for prior in ((), ("--prior", "5600", "60")))
         assert (alone["method"], carried["method"]) == ("kalman", "least-squares")
         low_s, _, high_s = alone["eod_time_s"]
         assert low_s < self.end_s < high_s and high_s - low_s > 5.0 * np.ptp(carried["eod_time_s"])
         assert alone["prior_q_mobile_C"] is None and alone["state_of_health"] == [None] * 3
         assert any("a cell of some 2 Ah" in note for note in alone["notes"])
         assert not any("2 Ah" in note for note in carried["notes"])
-        assert 0.6 < self.row(capsys, "running.csv", "--nominal", "2")["state_of_health"][1] < 0.9
+        assert 0.6 < terminal.row("forecast", "running.csv", "--nominal", "2")["state_of_health"][1] < 0.9
 
     @pytest.mark.parametrize(
         "options", ["", *sweep("--prior 5460 55", "--cut-off 3.2", "--initial-soc 0.98,0.01 --nominal 2")]
     )
     @pytest.mark.parametrize("name", sweep("running.csv", "pulsed.csv"))
-    def test_both_commands_give_one_end(self, name, options, capsys):
+    def test_both_commands_give_one_end(self, name, options, terminal):
         pulses = simulate(np.tile([3.0, 1.0], 2000).repeat(30), 6500.0, 0.12, load_unit="current", thermal=True, until=2000.0)
-        columns = {"time_s": pulses.time_s, "voltage_V": pulses.voltage_V, "current_A": pulses.current_A}
-        pd.DataFrame(columns).to_csv("pulsed.csv", index=False)
-        end = self.row(capsys, name, *options.split())
-        calibrate([name, *options.split(), "--json"])
-        row = json.loads(capsys.readouterr().out)
+        write(pulses, "pulsed.csv")
+        end = terminal.row("forecast", name, *options.split())
+        row = terminal.row(name, *options.split(), status=3)
         low_s, median_s, high_s = end["eod_time_s"]
         assert row["predicted_eod_time_s"] == median_s and row["remaining_s"] == end["remaining_s"][1]
         assert row["predicted_capacity_Ah"] == end["capacity_Ah"][1]
         assert row["sd_predicted_eod_time_s"] == pytest.approx((high_s - low_s) / 3.29)
 
-    def test_a_pause_at_the_end_and_a_poor_model_are_noted(self, capsys):
+    def test_a_pause_at_the_end_and_a_poor_model_are_noted(self, terminal):
         table = pd.read_csv("running.csv")
         rest = table.tail(1).assign(current_A=0.0)
         rest = pd.concat([rest.assign(time_s=rest["time_s"] + since_s) for since_s in (60.0, 120.0)])
         pd.concat([table, rest]).to_csv("paused.csv", index=False)
         known = ("--prior", "5460", "55")
-        plain, paused = (self.row(capsys, name, *known)["notes"] for name in ("running.csv", "paused.csv"))
+        plain, paused = (terminal.row("forecast", name, *known)["notes"] for name in ("running.csv", "paused.csv"))
         assert [note for note in paused if note not in plain] == [
             f"What was recorded after the last sample under load, at {table['time_s'].iloc[-1]:.0f} s, is left out."
         ]
-        sure = self.row(capsys, "running.csv", *known, "--mismatch", "0.01", status=3)["notes"]
+        sure = terminal.row("forecast", "running.csv", *known, "--mismatch", "0.01", status=3)["notes"]
         assert any("more than mismatch_V" in note for note in sure) and not any("mismatch_V." in note for note in plain)
 
-    def test_a_record_that_contradicts_its_estimate_has_its_own_status(self, capsys):
+    def test_a_record_that_contradicts_its_estimate_has_its_own_status(self, terminal):
         late = pd.read_csv("running.csv").query("time_s > 400")
         late.to_csv("late.csv", index=False)
-        row = self.row(capsys, "late.csv", "--life", "lab", status=3)
+        row = terminal.row("forecast", "late.csv", "--life", "lab", status=3)
         assert row["settled"] is False and "The record starts at 3" in row["notes"][0]
 
     def test_the_installed_command_has_the_others_behind_it(self, capsys, monkeypatch):
@@ -485,16 +463,19 @@ class TestCommand:
             (["running.csv", "--life", "lab", "--prior", "5000", "50"], "give one of them"),
             (["B0006:81", "--life", "B0005", "lab"], "discharges of B0005 and B0006: give those of the cell in progress"),
             (["lab"], "lab holds 2 files"),
+            (["lab/life.csv"], "reaches 2.7 V at"),
             (["running.csv", "--load", "lab/notes.txt"], "columns time_s and either current_A or power_W, got moved"),
             (["running.csv", "--load", "late.csv"], "late.csv: start_s must be finite and increase from 0"),
+            (["running.csv", "--load", "charge.csv"], "current_A is nowhere above 0"),
+            (["running.csv", "--load", "empty.csv"], "empty.csv: no table"),
             (["running.csv", "--load", "none.csv"], "none.csv"),
             (["running.csv", "--out", "running.csv"], "running.csv is a file"),
         ],
     )
-    def test_what_cannot_be_meant_is_refused_and_nothing_is_written(self, arguments, message, capsys):
+    def test_what_cannot_be_meant_is_refused_and_nothing_is_written(self, arguments, message, terminal):
         Path("late.csv").write_text("time_s,power_W\n10,4\n20,5\n")
+        Path("charge.csv").write_text("time_s,current_A\n0,-1.0\n600,-3.0\n")
+        Path("empty.csv").touch()
         before = sorted(Path().rglob("*"))
-        assert calibrate(["forecast", *arguments]) == 2
-        error = capsys.readouterr().err.splitlines()[-1]
-        assert error.startswith("error: ") and message in error
+        assert message in terminal.refuses("forecast", *arguments)
         assert sorted(Path().rglob("*")) == before

@@ -1,17 +1,17 @@
 """Discharges that do not start full: the charge is stated, or told from the rest before the load."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from battery_env import Discharge, LeastSquares, RecordModel, fit_cell, load_nasa_discharges, soc_from_rest, track_life
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
-from battery_env.lab.command_line import NOT_SETTLED, SETTLED, calibrate
+from battery_env.lab.command_line import NOT_SETTLED, SETTLED
 from battery_env.loads import constant
+from battery_env.sensors import SensorErrors
 from tests.sweeps import sweep
+from tests.terminal import write
 
 REST_S = 200
 
@@ -20,21 +20,12 @@ def partly_charged(soc: float, noise_V: float = 0.002, load_A: float = 2.0, cut_
     current_A = np.append(np.zeros(REST_S), np.full(20_000, load_A))
     start = initial_state(6000.0, soc=soc)
     record = simulate(current_A, 6000.0, 0.15, load_unit="current", thermal=True, initial=start, cut_off_V=cut_off_V)
-    noise = np.random.default_rng(0).normal(0.0, noise_V, len(record.time_s))
-    return replace(record, voltage_V=record.voltage_V + noise)
+    return SensorErrors(noise_V).apply(record, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
 def record():
     return partly_charged(0.8)
-
-
-class TestStart:
-    @pytest.mark.parametrize("soc", [0.3, 0.8, 1.0])
-    def test_the_state_of_charge_stays_where_q_mobile_moves(self, soc):
-        model = RecordModel(initial_soc=soc)
-        for q_mobile in (4000.0, 7600.0):
-            np.testing.assert_allclose(model.start(q_mobile), initial_state(q_mobile, soc=soc), rtol=1e-12, atol=1e-9)
 
 
 class TestRest:
@@ -89,36 +80,29 @@ def test_constants_whose_rest_does_not_rise_with_the_charge_do_not_tell_it():
 
 
 class TestCommandLine:
-    def row(self, record, folder, capsys, *options):
-        columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
-        pd.DataFrame(columns).to_csv(folder / "record.csv", index=False)
-        status = calibrate([str(folder / "record.csv"), "--json", *options])
-        return status, json.loads(capsys.readouterr().out)
-
     @pytest.mark.parametrize("method", ["least-squares", "kalman"])
-    def test_a_stated_charge(self, method, record, tmp_path, capsys):
-        options = ["--method", method, "--mismatch", "0.02", "--nominal", "2"]
-        status, row = self.row(record, tmp_path, capsys, *options, "--initial-soc", "0.8")
-        assert status == (SETTLED if method == "kalman" else NOT_SETTLED) and row["initial_soc"] == 0.8
+    def test_a_stated_charge(self, method, record, tmp_path, terminal):
+        options = [write(record, tmp_path / "record.csv"), "--method", method, "--mismatch", "0.02", "--nominal", "2"]
+        status = SETTLED if method == "kalman" else NOT_SETTLED
+        row = terminal.row(*options, "--initial-soc", "0.8", status=status)
+        assert row["initial_soc"] == 0.8
         assert row["q_mobile_C"] == pytest.approx(6000.0, rel=0.02)
         # the capacity is that of a full cell
         full = RecordModel(NEW_CELL.replace(q_mobile=6000.0, r_o=0.15), thermal=True)
         (full,) = full.capacity_Ah([constant(2.0, "current")], 2.8)
         assert row["capacity_Ah"] is None and row["predicted_capacity_Ah"] == pytest.approx(full, rel=0.03)
         assert row["state_of_health"] == pytest.approx(full / 2.0, rel=0.03)
-        status, row = self.row(record, tmp_path, capsys, *options)
-        assert status == NOT_SETTLED and "state initial_soc (--initial-soc)" in row["reason"]
-        status, row = self.row(record, tmp_path, capsys, *options, "--initial-soc", "0.8,0.05")
-        assert status == NOT_SETTLED and row["sd_initial_soc"] == 0.05
+        assert "state initial_soc (--initial-soc)" in terminal.row(*options, status=NOT_SETTLED)["reason"]
+        assert terminal.row(*options, "--initial-soc", "0.8,0.05", status=NOT_SETTLED)["sd_initial_soc"] == 0.05
 
     @pytest.mark.parametrize("method", ["least-squares", "kalman"])
-    def test_a_rest(self, method, record, tmp_path, capsys):
-        options = ["--method", method, "--mismatch", "0.001", "--initial-soc", "rest"]
-        _, row = self.row(record, tmp_path, capsys, *options)
+    def test_a_rest(self, method, record, tmp_path, terminal):
+        path, options = tmp_path / "record.csv", ["--method", method, "--mismatch", "0.001", "--initial-soc", "rest"]
+        row = terminal.row(write(record, path), *options, status=SETTLED if method == "least-squares" else NOT_SETTLED)
         assert row["initial_soc"] == pytest.approx(0.8, abs=0.02) and 0.0 < row["sd_initial_soc"] < 0.02
         assert abs(row["q_mobile_C"] - 6000.0) < 3.0 * row["sd_q_mobile_C"] < 500.0
-        status, row = self.row(record.part(REST_S - 20, len(record.time_s)), tmp_path, capsys, *options)
-        assert status == NOT_SETTLED and "The record does not start with a minute at rest" in row["reason"]
+        row = terminal.row(write(record.part(REST_S - 20, len(record.time_s)), path), *options, status=NOT_SETTLED)
+        assert "The record does not start with a minute at rest" in row["reason"]
 
 
 class TestOthers:

@@ -16,17 +16,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from battery_env import calibrate, load_nasa_discharges, read_discharges
+from battery_env import calibrate, read_discharges
 from battery_env.lab import running as running_module
 from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.discharges import read_recordings
 from battery_env.lab.readers.testers import TESTERS, joined
 from battery_env.lab.sources import Source, find_sources
+from tests.tables import LOADED, RECORD, TABLE, clock, near, read
 
-RECORD = load_nasa_discharges("B0006")[99]
-TABLE = pd.DataFrame({"time": RECORD.time_s, "voltage": RECORD.voltage_V, "current": -RECORD.current_A})
-LOADED = (TABLE["current"] < -1.0).to_numpy()
 LOAD_ON = int(np.argmax(LOADED))
 ROWS = len(TABLE)
 #: A charge and a rest, as they come before the discharge.
@@ -36,21 +34,6 @@ CYCLE = pd.concat([CHARGE, REST, TABLE.assign(time=4200.0 + TABLE["time"])], ign
 START = pd.Timestamp("2026-02-27 23:50")
 DATES = START + pd.to_timedelta(RECORD.time_s, unit="s")
 COUNTED_AH = np.append(0.0, np.cumsum(RECORD.current_A.clip(0.0)[:-1] * np.diff(RECORD.time_s))) / 3600.0
-
-
-def read(table, said="", **options):
-    """Return the one discharge of a table, and check what is said of it; nothing by default."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        (discharge,) = read_discharges(table, **options)
-    messages = "; ".join(str(each.message) for each in caught)
-    assert (said in messages) if said else not messages, messages
-    return discharge
-
-
-def near(discharge, share=2e-3):
-    assert discharge.charge_C == pytest.approx(RECORD.charge_C, rel=share)
-    assert (np.diff(discharge.time_s) > 0.0).all()
 
 
 def named(*names, **columns):
@@ -63,10 +46,6 @@ def at(row, **values):
     table = TABLE.astype(object)
     table.loc[row, [*values]] = [*values.values()]
     return table
-
-
-def clock(seconds):
-    return f"{int(seconds // 3600)}:{int(seconds // 60 % 60):02d}:{seconds % 60:06.3f}"
 
 
 CLOCK = {"Total Time (Hours in hh:mm:ss)": [*map(clock, RECORD.time_s)]}
@@ -176,6 +155,10 @@ REFUSED = {
     "no current": (named(current=0.0), "no current flows"),
     "so little that it is noise": (named(current=1e-6 * (TABLE.index == 7)), "no current flows"),
     "no sign": (HALF_SIGN, r"the current has no sign: from row 1 on the voltage rises.*--columns state=NAME"),
+    "words that contradict the voltage": (
+        CYCLE.assign(state=np.where(CYCLE["current"] > 0.0, "Discharge", "Charge")),
+        r"contradict each other \(1\.00, -1\.00\)",
+    ),
     "no voltage that tells the sign": (named(voltage=3.7), "cannot be told.*State it: --discharge-is-negative"),
     "jumps against what passes": (
         named(voltage=RECORD.voltage_V + 0.3 * RECORD.current_A),
@@ -344,12 +327,6 @@ def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter)
     voltage_V = 4.19 - 1.4 * charge_C / 7200.0 - 0.1 * current_A
     columns = {"time": np.cumsum(every_s), "voltage": voltage_V, "current": -current_A, "Cycle": (step + 5 - counter) // 6}
     assert read(pd.DataFrame(columns)).charge_C == pytest.approx(charge_C[-1], rel=0.02)
-
-
-def test_words_that_contradict_the_voltage_are_refused():
-    words = np.where(CYCLE["current"] > 0.0, "Discharge", "Charge")
-    with pytest.raises(ValueError, match=r"contradict each other \(1\.00, -1\.00\)"):
-        read_discharges(CYCLE.assign(state=words))
 
 
 def test_what_is_left_aside_is_named_and_a_mistake_in_some_cycles_loses_no_other():

@@ -26,15 +26,11 @@ from battery_env.lab.readers import tables
 from battery_env.lab.sources import find_sources
 from tests.faults import a_full_disk, squared_unless_it_ends_its_process
 from tests.sweeps import sweep
+from tests.terminal import write
 
 ROWS = 8
 # of a discharge, without its rows
 VOLTAGES = {"csv": b"time_s,voltage_V,current_A,model_V\n", "png": b"picture"}
-
-
-def write(record, path, **more):
-    columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
-    pd.DataFrame(columns).assign(**more).to_csv(path, index=False)
 
 
 @pytest.fixture(scope="module")
