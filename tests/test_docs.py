@@ -208,18 +208,14 @@ def test_every_picture_has_a_caption(page):
 
 
 @pytest.mark.parametrize("name", STYLED)
-def test_tables_of_the_guide_fit_the_column_of_the_site(name):
+def test_tables_and_code_of_the_guide_fit_the_column_of_the_site(name):
+    wide = [line for block in blocks(ROOT / f"{name}.md", "python") for line in block.splitlines() if len(line) > 97]
+    assert not wide
     for row in published(ROOT / f"{name}.md"):
         assert len(row) <= 6, row
         for cell in row:
             words = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", cell).split()
             assert len(words) <= 25, f"{len(words)} words: {cell}"
-
-
-@pytest.mark.parametrize("name", STYLED)
-def test_code_of_the_guide_fits_the_column_of_the_site(name):
-    wide = [line for block in blocks(ROOT / f"{name}.md", "python") for line in block.splitlines() if len(line) > 97]
-    assert not wide
 
 
 def test_reports_are_short_enough_to_be_read():

@@ -23,6 +23,7 @@ from battery_env.records.discharge import Discharge, load_nasa_discharges
 from tests.sweeps import sweep
 
 FIELDS = ("cell", "constants", "discharges", "mismatch_V", "thermal")
+TOO_LARGE = '{"format": "battery_env.CellParameters", "version": 1, "constants": {"kn": 1' + 400 * "0" + "}}"
 OTHER = with_equilibrium(NEW_CELL, [0.02, -0.03, 0.02]).replace(kn=1000.0, tDiffusion=9e6, to=10.0, tsn=600.0, VEOD=2.7)
 
 
@@ -164,7 +165,6 @@ class TestSimulated:
 
 
 class TestRealCells:
-
     @pytest.mark.parametrize("size", sweep(120.0, 0.02))
     def test_cells_of_any_size_have_constants(self, b0005_fit, size):
         discharges = load_nasa_discharges("B0005")
@@ -294,7 +294,7 @@ class TestFiles:
         with pytest.raises(ValueError, match=message):
             kind.from_json(path)
 
-    @pytest.mark.parametrize("text", ["", "{", "[]", "null", '"text"', "\udcff", "{}"])
+    @pytest.mark.parametrize("text", ["", "{", "[" * 3_000, "[]", "null", '"text"', "\udcff", "PK\3\4", "{}", TOO_LARGE])
     @pytest.mark.parametrize("kind", [CellFit, CellParameters])
     def test_what_is_no_such_file_is_refused(self, kind, text, tmp_path):
         path = tmp_path / "cell.json"

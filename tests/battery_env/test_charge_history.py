@@ -59,8 +59,7 @@ class TestLoadOn:
         assert found.settled_q_mobile == (lost_s < 200.0) and is_right(found)
         assert abs(found.drawn_Ah - whole.charge_C / 3600.0) * 3600.0 < 2.5 * found.record.history.load_on_C + LOAD_A * 10.0
 
-    @pytest.mark.parametrize("rows", [1, 2])
-    def test_a_row_that_mixes_rest_and_load_does_not_decide(self, rows):
+    def test_a_row_that_mixes_rest_and_load_does_not_decide(self):
         first = int(np.argmax(REAL.current_A > 1.0))
         voltage_V = REAL.voltage_V.copy()
         voltage_V[first - 1] = voltage_V[first] + 0.002

@@ -94,7 +94,6 @@ class TestUncertainty:
 
 
 class TestGuards:
-
     def test_a_prior_far_below_is_pushed_up_by_the_charge_drawn(self):
         record = measured()
         drawn_C = np.append(0.0, np.cumsum(record.current_A)[:-1])
@@ -113,12 +112,13 @@ class TestGuards:
 class TestOnline:
     def test_updates_and_traces_agree(self):
         records = [measured(seed=n, q_mobile=q).part(0, 700) for n, q in enumerate((7000.0, 4000.0))]
-        # and in a cold room, which tells the temperature around the cell
-        part = records[0]
-        records.append(Discharge(part.time_s, part.voltage_V, part.current_A, np.full(700, 5.0), starts_at_rest=True))
+        # and in a cold room that is heated, which tells the temperature around the cell
+        part, warming_C = records[0], np.linspace(5.0, 30.0, 700)
+        records.append(Discharge(part.time_s, part.voltage_V, part.current_A, warming_C, starts_at_rest=True))
         filter_ = ExtendedKalmanFilter(thermal=True)
         batch, single = filter_.trace(records), [OnlineEstimator.follow(filter_, record) for record in records]
         for one, other in zip(batch, single, strict=True):
             for name in (field.name for field in fields(EstimateTrace)):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
         assert filter_.estimate(records[1]).q_mobile == batch[1].q_mobile[-1]
+        assert abs(batch[2].r_o[-1] / batch[0].r_o[-1] - 1.0) > 1e-4

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from battery_env import Discharge, ExtendedKalmanFilter, LeastSquares, cramer_rao_bound, load_nasa_discharges
+from battery_env import Discharge, ExtendedKalmanFilter, LeastSquares, SensorErrors, cramer_rao_bound, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.error import ErrorModel
@@ -17,9 +17,7 @@ from tests.sweeps import sweep
 def discharged(
     q_mobile: float = 6000.0, r_o: float = 0.15, load=8.0, noise_V: float = 0.0, seed: int = 0, **more
 ) -> Trajectory:
-    trajectory = simulate(load, q_mobile, r_o, **more)
-    noise = np.random.default_rng(seed).normal(0.0, noise_V, len(trajectory.time_s))
-    return replace(trajectory, voltage_V=trajectory.voltage_V + noise)
+    return SensorErrors(noise_V).apply(simulate(load, q_mobile, r_o, **more), np.random.default_rng(seed))
 
 
 def steps(seed: int) -> np.ndarray:
@@ -134,7 +132,6 @@ class TestNoise:
 
 
 class TestHeldParameters:
-
     @pytest.mark.parametrize(
         ("bounds", "name", "value"),
         [
@@ -162,8 +159,7 @@ def discharged_otherwise(noise_V=0.005, seed=0, factors=OFF, thermal=False):
     """A discharge of a cell whose constants are others than the model's."""
     cell = NEW_CELL.replace(**{name: factor * getattr(NEW_CELL, name) for name, factor in factors.items()})
     record = simulate(steps(seed), 6000.0, 0.15, cell=cell, thermal=thermal)
-    noise = np.random.default_rng(seed).normal(0.0, noise_V, len(record.time_s))
-    return replace(record, voltage_V=record.voltage_V + noise)
+    return SensorErrors(noise_V).apply(record, np.random.default_rng(seed))
 
 
 class TestNuisanceConstants:
@@ -211,7 +207,6 @@ class TestNuisanceConstants:
 
 
 class TestRealDischarges:
-
     @pytest.mark.parametrize("share", sweep(0.5, 0.1, 0.9))
     def test_an_unfinished_one_is_not_settled_and_a_prior_repairs_it(self, b0005, share):
         previous, record = b0005[98], b0005[99]

@@ -82,7 +82,6 @@ def test_steps_repeated_find_what_is_off(data, unknown):
 
 
 class TestTask:
-
     def test_it_is_shown_behind_the_rest_of_the_observation(self, data):
         shown = []
         for nuisance in (0.0, 0.2):

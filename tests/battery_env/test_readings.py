@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from battery_env import TrajectoryDataset
-from battery_env.electrochemistry import NEW_CELL, QNB, QNS, VO, simulate
+from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.loads import RandomPiecewise
 from battery_env.tasks.voltage.readings import SENSOR_ROWS, Readings, explain
 
@@ -24,16 +24,6 @@ def compare(readings, q_mobile, r_o, count=None, stretches=12):
     count = readings.count if count is None else count
     explain(np.arange(n), count, np.column_stack([q_mobile, r_o]), shown, readings.model, means, rms_V, last_V)
     return [*means, rms_V, last_V]
-
-
-def test_linear_part_is_that_of_the_simulation(aged_both, readings):
-    for n, trajectory in enumerate(aged_both):
-        part, at = readings.part(n), slice(10, 10 * readings.count[n] + 1, 10)
-        np.testing.assert_array_equal(readings.voltage_V[part], trajectory.voltage_V[at])
-        np.testing.assert_allclose(readings.moved_C[part], 0.1 * trajectory.q_mobile - trajectory.state[at, QNS], atol=1e-6)
-        in_bulk = 0.9 * trajectory.q_mobile - trajectory.state[at, QNB]
-        np.testing.assert_allclose(readings.drawn_C[part] - readings.moved_C[part], in_bulk, atol=1e-6)
-        np.testing.assert_allclose(readings.ohmic_A[part] * trajectory.r_o, trajectory.state[at, VO], atol=1e-9)
 
 
 def test_misfit_is_that_of_a_whole_simulation(aged_both, readings):

@@ -112,9 +112,6 @@ def test_nothing_is_known_after_the_model_cell_is_empty():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: RecordModel(dt_s=20.0), "dt must"),
-        (lambda: RecordModel(initial=np.zeros(7)), "initial must hold 8"),
-        (lambda: RecordModel().grid(replace(RECORD, time_s=np.zeros(len(RECORD.time_s)))), "time_s must increase"),
         (lambda: RecordModel().forecast(RECORD, Estimate(np.nan, 0.1)), "must lie within .* got nan"),
         (lambda: RecordModel().voltage(RECORD, Estimate(6000.0, np.nan)), "must lie within .* got nan"),
     ],

@@ -326,7 +326,6 @@ class TestGaps:
     @pytest.mark.parametrize("first_s", sweep(*range(0, 300, 50)))
     @pytest.mark.parametrize("every_s", sweep(300, 120))
     def test_a_charge_in_doubt_is_a_doubt_of_a_resistance_that_may_make_up_for_it(self, calibrator, every_s, first_s):
-        """Rows minutes apart once left an R_o settled that was 5 standard deviations off, in half a discharge."""
         record = discharged(np.append(np.zeros(600), np.full(20_000, 1.5)), noise_V=0.001)
         rows = slice(first_s % every_s, len(record.time_s) // 2, every_s)
         estimate = calibrator(mismatch_V=0.002).estimate(changed(record, rows, rested=False).loaded_part(2.7))
@@ -353,7 +352,6 @@ class TestPrecision:
 
     @pytest.mark.parametrize("offset_V", sweep(0.02, -0.035, -0.025, -0.02, 0.025, 0.035, 0.055))
     def test_what_the_voltage_at_rest_is_off_is_an_error_of_the_model(self, calibrator, offset_V):
-        """An offset of the sensor went into R_o, settled, which was 15 standard deviations off."""
         seen = replace(WHOLE, voltage_V=WHOLE.voltage_V + offset_V)
         estimate = calibrator(mismatch_V=0.003).estimate(seen)
         assert not estimate.settled_r_o or abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o
@@ -367,7 +365,6 @@ class TestPrecision:
 
     @pytest.mark.parametrize("index", sweep(24, 0, 48))
     def test_a_rest_makes_it_no_surer_of_a_resistance_than_the_error_of_its_model_allows(self, index):
-        """With the rest after the cut-off a stream once settled an R_o of half of the right one, 7 standard deviations off."""
         record = load_nasa_discharges("B0005")[index]
         right = CALIBRATORS["least squares"]().estimate(record.loaded_part(2.7))
         estimate = CALIBRATORS["filter"]().estimate(record)
@@ -375,7 +372,6 @@ class TestPrecision:
 
     @pytest.mark.parametrize("share", sweep(0.5, 0.25, 0.75))
     def test_before_the_knee_it_is_no_surer_than_least_squares_with_constants_of_young_discharges(self, young_fit, share):
-        """With an error stated too small it answered 4657 +- 84 C at half time; the whole discharge says 5986 C."""
         record = load_nasa_discharges("B0006")[64].loaded_part(2.7)
         seen = record.until(record.time_s[0] + share * (record.time_s[-1] - record.time_s[0]))
         stated = [Settings(cell=young_fit, method=method, mismatch_V=0.0055) for method in METHODS[:2]]

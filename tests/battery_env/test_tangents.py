@@ -32,7 +32,6 @@ def after(steps, q, r_o, thermal, current_A=2.0):
 @pytest.mark.parametrize("thermal", [False, True])
 @pytest.mark.parametrize("steps", [50, 1500, 2800])
 class TestOneCell:
-
     def test_voltage_to_second_order_along_them(self, steps, thermal):
         state, tangents = after(steps, 6000.0, 0.15, thermal)
         dq = 0.5

@@ -221,14 +221,6 @@ class TestMismatch:
         np.testing.assert_allclose(wrong.factors.std(axis=0) / wrong.factors.mean(axis=0), 0.3, atol=0.05)
         assert np.abs(np.corrcoef(wrong.factors.T) - np.eye(4)).max() < 0.2
 
-    def test_subsets_and_files_keep_them(self, wrong, tmp_path):
-        part = wrong.subset([7, 2])
-        for same in (part[1], wrong[1:3][1]):
-            np.testing.assert_array_equal(same.state, wrong[2].state)
-        again = TrajectoryDataset.load(part.save(tmp_path / "part"))
-        np.testing.assert_array_equal(again[0].state, wrong[7].state)
-        np.testing.assert_array_equal(again.factors, part.factors)
-
     def test_a_time_step_must_suit_the_fastest_cell(self):
         fast = {"loads": [constant(8.0)], "load_index": 0, "factors": np.array([[1.0, 1.0, 0.5, 1.0]])}
         assert len(TrajectoryDataset.simulated(7600.0, 0.1, dt_s=6.0, **fast)) == 1

@@ -31,7 +31,6 @@ def make(tmp_path, *arguments):
 
 
 class TestWork:
-
     @pytest.mark.parametrize("name", ["peers", "faults"])
     def test_the_parameter_that_is_held_is_the_new_cells_or_ten_per_cent_worn(self, name):
         work = COMPARISONS[name].work

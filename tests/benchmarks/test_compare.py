@@ -34,16 +34,6 @@ BatteryRo-v0:
 """
 
 
-def patch_held_out_trajectories(monkeypatch):
-    held_out = contests.held_out_trajectories
-
-    def shortest(env_id):
-        data = held_out(env_id)
-        return data.subset(np.argsort(data.samples)[:6])
-
-    monkeypatch.setattr(contests, "held_out_trajectories", shortest)
-
-
 @pytest.fixture(autouse=True)
 def small(tmp_path, monkeypatch):
     """Tiny networks, and few test trajectories."""
@@ -51,7 +41,13 @@ def small(tmp_path, monkeypatch):
     for algo in ("lac", "sac", "td3"):
         (tmp_path / "zoo_configs" / f"{algo}.yml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)
-    patch_held_out_trajectories(monkeypatch)
+    held_out = contests.held_out_trajectories
+
+    def shortest(env_id):
+        data = held_out(env_id)
+        return data.subset(np.argsort(data.samples)[:6])
+
+    monkeypatch.setattr(contests, "held_out_trajectories", shortest)
     for module in (compare, contests):
         monkeypatch.setattr(module, "EVALUATION_EPISODES", 2)
     monkeypatch.setattr(contests, "_SCORED_EPISODES", 3)

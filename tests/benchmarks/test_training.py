@@ -78,6 +78,11 @@ def test_a_policy_is_trained_once(tmp_path, trainings):
     assert isinstance(first, LAC) and first.num_timesteps == 40 and trainings == [0]
     assert [path.name for path in (tmp_path / "run").glob("*.csv")] == ["progress.csv"]
     assert len(list((tmp_path / "run").glob("model_*.zip"))) == 1
+    # beside it stands what made it
+    recipe = training.Recipe.of("lac", ENV_ID, 0, 40)
+    record = json.loads(training.record_file(recipe, tmp_path / "run").read_text())
+    assert training.Recipe(**record["recipe"]) == recipe and "torch" in record["versions"]
+    assert record["training_minutes"] > 0
     again = train(40, tmp_path / "run")
     assert trainings == [0]
     np.testing.assert_array_equal(parameters(again), parameters(first))
@@ -152,14 +157,6 @@ def test_training_follows_the_recipe_even_if_the_file_has_changed_since(tmp_path
     recipe = training.Recipe.of("lac", ENV_ID, 0)
     (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG.replace("alpha3: 0.7", "alpha3: 0.8"))
     assert training.set_up(recipe, tmp_path / "run")[1].alpha3 == 0.7
-
-
-def test_beside_a_model_stands_what_made_it(tmp_path):
-    train(25, tmp_path)
-    recipe = training.Recipe.of("lac", ENV_ID, 0, 25)
-    record = json.loads(training.record_file(recipe, tmp_path).read_text())
-    assert training.Recipe(**record["recipe"]) == recipe
-    assert record["training_minutes"] > 0 and "torch" in record["versions"]
 
 
 @pytest.mark.attacks

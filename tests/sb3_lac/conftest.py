@@ -1,6 +1,6 @@
 """A small environment with costs, and models that are quick to train on it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -44,15 +44,6 @@ class LinearCostEnv(gym.Env):
         self.state = np.clip(self.state + 0.5 * action, -10, 10).astype(np.float32)
         end = self.n_steps >= self.episode_length
         return self.state, self.offset - cost, end and self.terminate, end and not self.terminate, {"cost": cost}
-
-
-@pytest.fixture(autouse=True)
-def _single_thread() -> Iterator[None]:
-    """Small networks are faster, and reproducible, on one thread."""
-    n_threads = th.get_num_threads()
-    th.set_num_threads(1)
-    yield
-    th.set_num_threads(n_threads)
 
 
 @pytest.fixture

@@ -43,7 +43,6 @@ def linear_env():
 
 @pytest.fixture(scope="module")
 def optimal(linear_env):
-    th.set_num_threads(1)
     controller = reference_controller(gym.make("LinearCost-v0"))
     return controller, fit_lyapunov(controller, linear_env, 50, seed=0, **FIT)
 

@@ -112,18 +112,6 @@ def test_actions_are_those_of_the_mean_in_float32(algorithm, low, high, dtype, k
     assert_alike(policy, model, observations)
 
 
-def test_no_damaged_file_answers_otherwise(tmp_path):
-    whole = export_onnx(new_model(), tmp_path / "policy").read_bytes()
-    damaged, rng = tmp_path / "damaged.onnx", np.random.default_rng(0)
-    for place in rng.integers(len(whole), size=100):
-        content = bytearray(whole)
-        content[place] ^= 1 << rng.integers(8)
-        damaged.write_bytes(content)
-        if place < len(whole) - 76:  # of all but the checksum itself
-            with pytest.raises(ValueError, match=r"damaged\.onnx is damaged: its checksum is wrong"):
-                OnnxPolicy(damaged)
-
-
 @pytest.mark.parametrize(
     ("make_model", "message"),
     [
@@ -159,12 +147,17 @@ def test_bad_files_and_observations_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"text.onnx is no ONNX file"):
         OnnxPolicy(tmp_path / "text.onnx")
     policy = OnnxPolicy(export_onnx(new_model(env="LinearCost-v0").policy, tmp_path / "policy"))
-    with pytest.raises(ValueError, match="must have shape"):
+    with pytest.raises(ValueError, match=r"observation must have shape \(n, 2\), got \(1, 3\)"):
         policy.predict(np.zeros((1, 3)))
     with pytest.raises(ValueError, match="deterministic"):
         policy.predict(np.zeros((1, 2)), deterministic=False)
     with pytest.raises(ValueError, match="which environment"):
         policy.env_id  # noqa: B018
+    content = bytearray((tmp_path / "policy.onnx").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "damaged.onnx").write_bytes(content)
+    with pytest.raises(ValueError, match=r"damaged\.onnx is damaged: its checksum is wrong"):
+        OnnxPolicy(tmp_path / "damaged.onnx")
 
 
 def test_a_graph_of_a_constant_action_is_not_written(tmp_path, monkeypatch):

@@ -14,19 +14,7 @@ from sb3_lac import LAC, PublishedLAC
 
 def assert_same(value, other):
     """Compare nested state dicts, numbers and tensors exactly."""
-    assert type(value) is type(other)
-    if isinstance(value, dict):
-        assert value.keys() == other.keys()
-        for key in value:
-            assert_same(value[key], other[key])
-    elif isinstance(value, (list, tuple)):
-        assert len(value) == len(other)
-        for item, other_item in zip(value, other, strict=True):
-            assert_same(item, other_item)
-    elif isinstance(value, th.Tensor):
-        assert th.equal(value, other)
-    else:
-        assert value == other
+    th.testing.assert_close(value, other, rtol=0, atol=0)
 
 
 def assert_same_learned_state(model, other):

@@ -168,6 +168,7 @@ def test_ends_of_episodes(make_exact_model):
     # Wilson's interval of one death in two episodes
     assert report.metrics["death_rate"] == pytest.approx((0.5, 0.0945, 0.9055), abs=1e-4)
     assert report.by_cost["n_transitions"].sum() == 4
+    assert len(report.plot().axes) == 4
 
 
 @pytest.mark.parametrize("n", sweep(72, 2, 71))
@@ -389,13 +390,6 @@ def test_episode_without_an_end_is_noticed(make_model, make_env, monkeypatch):
     monkeypatch.setattr(rollout, "MANY_STEPS", 19)
     with pytest.warns(UserWarning, match="gone on for 19 steps. If it never ends"):
         evaluate_lyapunov(make_model(n_collect=0), make_env(episode_length=25), 1)
-
-
-def test_figures(make_exact_model):
-    starts = np.random.default_rng(0).uniform(-2, 2, (30, 3)).tolist()
-    arguments = {"starts": starts, "lengths": (10, 12), "deaths": (False, False, True)}
-    report = evaluate_lyapunov(make_exact_model(**arguments), ContractionEnv(**arguments), 30)
-    assert len(report.plot().axes) == 4
 
 
 # Callback
