@@ -4,7 +4,7 @@ import math
 import os
 import warnings
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -384,16 +384,11 @@ class CostAlgorithm(OffPolicyAlgorithm):
         )
 
     def save(self, path: Any, *args: Any, **kwargs: Any) -> None:
-        # A file that is there stays until the new one is whole
-        if not isinstance(path, (str, os.PathLike)):
-            return super().save(path, *args, **kwargs)
-        with replacing(with_suffix(path, ".zip")) as part:
+        with whole(path, ".zip") as part:
             super().save(part, *args, **kwargs)
 
     def save_replay_buffer(self, path: Any) -> None:
-        if not isinstance(path, (str, os.PathLike)):
-            return super().save_replay_buffer(path)
-        with replacing(with_suffix(path, ".pkl")) as part:
+        with whole(path, ".pkl") as part:
             super().save_replay_buffer(part)
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
@@ -495,7 +490,9 @@ def reward_scale(vec_normalize: VecNormalize | None) -> float:
     return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)
 
 
-def with_suffix(path: str | os.PathLike[str], suffix: str) -> Path:
-    """The path that Stable-Baselines3 writes to."""
+def whole(path: Any, suffix: str) -> AbstractContextManager[Any]:
+    """What Stable-Baselines3 writes to: a file that is there stays until the new one is whole."""
+    if not isinstance(path, (str, os.PathLike)):
+        return nullcontext(path)
     path = Path(path)
-    return path if path.suffix else path.with_name(path.name + suffix)
+    return replacing(path if path.suffix else path.with_name(path.name + suffix))

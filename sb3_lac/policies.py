@@ -23,6 +23,11 @@ def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
     return reduce(th.maximum, values)
 
 
+def signed_power(values: th.Tensor, exponent: int) -> th.Tensor:
+    """A power that keeps the sign."""
+    return values * values.abs().pow(exponent - 1)
+
+
 class LyapunovCritic(BaseModel):
     """
     Lyapunov critic network(s): each maps state and action to a value ``L(s, a) >= 0``, the cost to come. What a network learns
@@ -146,7 +151,8 @@ class SumOfSquaresCritic(LyapunovCritic):
 class RootCritic(LyapunovCritic):
     """
     Lyapunov critic of ``LAC``: each network learns the fourth root ``f(s, a)`` of what ``L`` is above its floor, about the
-    value of the loop at rest: ``L = offset + floor + sign(f) |f|^4``. The arguments are those of ``LyapunovCritic``.
+    value of the loop at rest: ``L = offset + floor + sign(f) |f|^4``. The arguments are those of ``LyapunovCritic``, and
+    ``root=2`` for the square root.
 
     Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` is a thousand times larger at a
     thousand times the cost, and one of ``f`` less than six times. The unit of the costs is nothing but a factor of ``f``. With
@@ -160,8 +166,11 @@ class RootCritic(LyapunovCritic):
 
     n_outputs = 1
 
-    def __init__(self, *args: Any, **kwargs: Any):
+    def __init__(self, *args: Any, root: int = 4, **kwargs: Any):
+        if root not in (2, 4):
+            raise ValueError(f"root={root} must be 4, of the fourth root, or 2, of the square root.")
         super().__init__(*args, **kwargs)
+        self.degree = root
         # What all values have in common. Set by the algorithm, saved with the weights
         self.floor: th.Tensor
         self.register_buffer("floor", th.zeros(1))
@@ -171,10 +180,10 @@ class RootCritic(LyapunovCritic):
         Get what the networks learn of values.
 
         :param values: Values relative to the offset
-        :return: As many fourth roots of what the values are above the floor, negative below it
+        :return: As many roots of what the values are above the floor, negative below it
         """
         above = values - self.floor
-        return above.sign() * above.abs().pow(0.25)
+        return above.sign() * above.abs().pow(1 / self.degree)
 
     def value(self, roots: th.Tensor) -> th.Tensor:
         """
@@ -183,7 +192,7 @@ class RootCritic(LyapunovCritic):
         :param roots: What the networks learn
         :return: As many values relative to the offset, the inverse of ``root()``
         """
-        return roots.pow(3) * roots.abs() + self.floor
+        return signed_power(roots, self.degree) + self.floor
 
     def distance(self, roots: th.Tensor) -> th.Tensor:
         """
@@ -192,7 +201,7 @@ class RootCritic(LyapunovCritic):
         :param roots: What the networks learn
         :return: As many square roots of what the values are above the floor, negative below it
         """
-        return roots * roots.abs()
+        return signed_power(roots, self.degree // 2)
 
     def lyapunov_of(self, output: th.Tensor) -> th.Tensor:
         return (self.value(output) + self.offset).clamp(min=0.0)
@@ -209,30 +218,11 @@ class LyapunovPolicy(SACPolicy):
 
       model = LAC("MlpPolicy", "LinearCost-v0", policy_kwargs=dict(net_arch=[64, 64], n_critics=1))
 
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param lr_schedule: Learning rate schedule (could be constant)
-    :param net_arch: The specification of the policy and Lyapunov networks.
-    :param activation_fn: Activation function
-    :param use_sde: Whether to use State Dependent Exploration or not
-    :param log_std_init: Initial value for the log standard deviation
-    :param use_expln: Use ``expln()`` function instead of ``exp()`` when using gSDE to ensure
-        a positive standard deviation (cf paper). It allows to keep variance
-        above zero and prevent it from growing too fast. In practice, ``exp()`` is usually enough.
-    :param clip_mean: Clip the mean output when using gSDE to avoid numerical instability.
-    :param features_extractor_class: Features extractor to use.
-    :param features_extractor_kwargs: Keyword arguments
-        to pass to the features extractor.
-    :param normalize_images: Whether to normalize images or not,
-         dividing by 255.0 (True by default)
-    :param optimizer_class: The optimizer to use,
-        ``th.optim.Adam`` by default
-    :param optimizer_kwargs: Additional keyword arguments,
-        excluding the learning rate, to pass to the optimizer
-        (the fused implementation of ``th.optim.Adam`` is used, unless ``fused``, ``foreach`` or ``differentiable`` is given)
-    :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
-    :param share_features_extractor: Whether to share or not the features extractor
-        between the actor and the critic (this saves computation time)
+    :param args: Arguments of SAC's policy, spaces and the schedule of the learning rate first
+    :param root: Which root of ``L`` the critics learn, 4 (the default) or 2. The square root has less bias where chance, or
+        what no observation tells, decides on costs; small costs count less beside large ones.
+    :param kwargs: The other arguments of SAC's policy, among them ``n_critics``, of whose values the largest is used. Adam is
+        the fused one, unless ``optimizer_kwargs`` has ``fused``, ``foreach`` or ``differentiable``.
     """
 
     critic: LyapunovCritic  # type: ignore[assignment]
@@ -241,6 +231,10 @@ class LyapunovPolicy(SACPolicy):
     reward_bound: th.Tensor
     critic_class: ClassVar[type[LyapunovCritic]] = RootCritic
 
+    def __init__(self, *args: Any, root: int | None = None, **kwargs: Any):
+        self.root = root
+        super().__init__(*args, **kwargs)
+
     def _build(self, lr_schedule: Schedule) -> None:
         # Other implementations of Adam exclude the fused one
         if self.optimizer_class is th.optim.Adam and not {"fused", "foreach", "differentiable"} & self.optimizer_kwargs.keys():
@@ -248,11 +242,14 @@ class LyapunovPolicy(SACPolicy):
             self.optimizer_kwargs = {"fused": True, **self.optimizer_kwargs}
         # The reward that costs nothing, which the critics' offset belongs to. Set by the algorithm, saved with the weights
         self.register_buffer("reward_bound", th.zeros(1))
+        if self.root is not None:
+            self.critic_kwargs["root"] = self.root
         super()._build(lr_schedule)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        # The one argument that SACPolicy leaves out
-        return super()._get_constructor_parameters() | {"share_features_extractor": self.share_features_extractor}
+        # What SACPolicy leaves out
+        others = {"share_features_extractor": self.share_features_extractor, "root": self.root}
+        return super()._get_constructor_parameters() | others
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LyapunovCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
@@ -297,7 +294,7 @@ class CnnPolicy(LyapunovPolicy):
     """
 
     def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)  # type: ignore[misc]
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
 
 
 class MultiInputPolicy(LyapunovPolicy):
@@ -310,7 +307,7 @@ class MultiInputPolicy(LyapunovPolicy):
     """
 
     def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)  # type: ignore[misc]
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
 
 
 class PublishedPolicy(LyapunovPolicy):

@@ -148,3 +148,16 @@ def test_fused_optimizer_updates_layers_of_any_memory_layout(make_model, make_en
             th.testing.assert_close(parameter, expected[name], rtol=0, atol=1e-5, msg=f"{module}.{name}")
             if name.endswith("unused"):
                 assert parameter.grad is None and (parameter == 1).all()
+
+
+def test_the_root_is_kept_in_files_and_is_one_of_lac_alone(make_model, tmp_path):
+    policy = make_model(n_collect=0, policy_kwargs={"root": 2}).policy
+    policy.save(tmp_path / "policy.zip")
+    values = th.tensor([[-1.0], [0.0], [9.0]])
+    for critic in (policy.critic, policy.critic_target, LyapunovPolicy.load(tmp_path / "policy.zip").critic):
+        assert critic.root(values).flatten().tolist() == [-1.0, 0.0, 3.0]
+        assert th.equal(critic.value(critic.root(values)), values) and th.equal(critic.distance(values), values)
+    with pytest.raises(ValueError, match="root=3 must be 4, of the fourth root, or 2"):
+        make_model(policy_kwargs={"root": 3})
+    with pytest.raises(TypeError, match="root"):
+        make_model(algorithm=PublishedLAC, policy_kwargs={"root": 2})

@@ -31,17 +31,17 @@ def roots_of(weights, obs, actions, n_critics):
     return th.stack(outputs)
 
 
-def root(value):
-    return th.sign(value) * th.sqrt(th.sqrt(abs(value)))
+def root(value, degree):
+    return th.sign(value) * abs(value) ** (1 / degree)
 
 
 def distance(value):
     return th.sign(value) * th.sqrt(abs(value))
 
 
-def relative(roots):
+def relative(roots, degree):
     """L of the largest of several critics, above its floor."""
-    return roots.amax(dim=0) ** 3 * abs(roots.amax(dim=0))
+    return th.sign(roots.amax(dim=0)) * abs(roots.amax(dim=0)) ** degree
 
 
 class ScalarAdam:
@@ -76,10 +76,10 @@ def test_the_value_behind_each_sample_is_discounted_as_it_says_and_not_negative(
     assert train_metrics(model)["critic_loss"] == pytest.approx(expected.item(), rel=1e-4)
 
 
-@pytest.mark.parametrize(("n_critics", "bound"), [(1, 0.0), (2, 0.0), (1, 3.0), (2, 3.0)])
-def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics, bound):
+@pytest.mark.parametrize(("n_critics", "bound", "degree"), [(1, 0.0, 4), (2, 0.0, 4), (1, 3.0, 4), (2, 3.0, 4), (2, 3.0, 2)])
+def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics, bound, degree):
     # With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
-    policy_kwargs = {"optimizer_class": th.optim.SGD, "n_critics": n_critics}
+    policy_kwargs = {"optimizer_class": th.optim.SGD, "n_critics": n_critics, "root": degree}
     model = make_model_without_env(reward_bound=bound, policy_kwargs=policy_kwargs, **SETTINGS)
     th.manual_seed(0)
     batch = ReplayBufferSamples(
@@ -110,20 +110,20 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         actions_pi, log_prob = policy_sample(actor, obs)
         with th.no_grad():
             next_actions = mean_action(actor, next_obs)
-            next_values = relative(roots_of(critic_target, next_obs, next_actions, n_critics)) + target_floor
+            next_values = relative(roots_of(critic_target, next_obs, next_actions, n_critics), degree) + target_floor
             next_values = th.maximum(next_values, -th.tensor(offset))
             # y - offset, where bound + GAMMA * offset is the offset
             y = costs - bound + GAMMA * (1 - dones) * next_values
             floor = (1 - TAU) * floor + TAU * y.min()
             target_floor = (1 - TAU) * target_floor + TAU * floor
         roots = roots_of(critic, obs, actions, n_critics)
-        critic_loss = (0.5 * (roots - root(y - floor)) ** 2).mean(dim=1).sum()
-        values = (relative(roots) + floor + offset).clamp(min=0).detach()
+        critic_loss = (0.5 * (roots - root(y - floor, degree)) ** 2).mean(dim=1).sum()
+        values = (relative(roots, degree) + floor + offset).clamp(min=0).detach()
         next_roots = roots_of(critic, next_obs, next_actions, n_critics)
-        difference = distance(relative(next_roots)) - distance(relative(roots.detach()) - ALPHA3 * costs)
+        difference = distance(relative(next_roots, degree)) - distance(relative(roots.detach(), degree) - ALPHA3 * costs)
         # Where the episode goes on
         d = difference[dones == 0].mean()
-        objective = distance(relative(roots_of(critic, obs, actions_pi, n_critics))).mean()
+        objective = distance(relative(roots_of(critic, obs, actions_pi, n_critics), degree)).mean()
         lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
         actor_loss = lambda_ * objective + beta * log_prob.mean()
         violation = log_prob.mean().item() - 2.0  # target entropy: minus the number of actions
