@@ -125,9 +125,9 @@ def cells_held(rows: pd.DataFrame, names: list[str], ours: str) -> str:
     """In how many cells one of ours is ahead of the best of the others that saw the same, or level with it."""
     held, of = 0, 0
     for _, of_env in rows.groupby("task", sort=False):
-        by_name = of_env.groupby("algorithm")
-        for seen in {name.removeprefix(ours) for name in by_name.groups if name.split(",")[0] == ours}:
-            rivals = [rival + seen for rival in RIVALS if rival + seen in by_name.groups]
+        by_name, there = of_env.groupby("algorithm"), set(of_env["algorithm"])
+        for seen in {name.removeprefix(ours) for name in there if name.split(",")[0] == ours}:
+            rivals = [rival + seen for rival in RIVALS if rival + seen in there]
             if rivals:
                 lac, *others = (over_seeds(by_name.get_group(each)[names])[0] for each in (ours + seen, *rivals))
                 held += int((LEVEL * lac <= np.min(others, axis=0)).sum())
