@@ -105,16 +105,14 @@ def test_constants_of_cells_that_did_not_start_full_are_warned_of_whenever_they_
     ],
 )
 def test_nothing_is_fitted_to_bad_input_and_nothing_is_overwritten(
-    arguments, message, recorded, tmp_path, monkeypatch, capsys
+    arguments, message, recorded, tmp_path, monkeypatch, terminal
 ):
     monkeypatch.chdir(tmp_path)
     write(recorded.until(1500.0), Path("half.csv"))
     for name in ("old.json", "old_fit.png"):
         Path(name).write_text("precious")
     Path("notes.txt").write_text("Dear all,\nplease find the data attached.\n")
-    assert command(["fit", *arguments]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("error: ") and message in error
+    assert message in terminal.refuses("fit", *arguments)
     assert {path.name for path in tmp_path.iterdir()} == {"old.json", "old_fit.png", "notes.txt", "half.csv"}
     assert Path("old.json").read_text() == Path("old_fit.png").read_text() == "precious"
 
@@ -211,6 +209,7 @@ POLICY = ["B0005:100", "--method", "policy"]
     ("arguments", "message"),
     [
         (["missing.csv"], "no file 'missing.csv'"),
+        (["forcast", "x.csv"], "did you mean battery-calibrate forecast?"),
         (["B0005:0"], "B0005:1 .. B0005:168"),
         (["life.csv:4"], "life.csv:1 .. life.csv:3"),
         (["pictures"], "holds no file whose name ends as that of a record (.csv"),

@@ -147,9 +147,12 @@ def test_options_out_of_range_are_refused(option, value, message):
 
 
 def test_cells_whose_constants_are_not_the_models_are_refused():
-    data = TrajectoryDataset.generate("r_o", 2, [constant(12.0)], seed=0, mismatch=0.2)
-    with pytest.raises(ValueError, match="constants of their own"):
-        make(data, BatteryRo)
+    loads = [constant(12.0)]
+    of_rates = TrajectoryDataset.generate("r_o", 2, loads, seed=0, mismatch=0.2)
+    of_equilibrium = TrajectoryDataset.simulated(7600.0, 0.15, loads, 0, equilibrium_V=np.full((1, 8), 0.01))
+    for data in (of_rates, of_equilibrium):
+        with pytest.raises(ValueError, match="constants of their own"):
+            make(data, BatteryRo)
 
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")

@@ -13,7 +13,6 @@ import pytest
 
 from battery_env import NEW_CELL, calibrate, load_nasa_discharges
 from battery_env import __file__ as package
-from battery_env.__main__ import calibrate as command
 
 pytest.importorskip("streamlit")
 pytest.importorskip("plotly")
@@ -143,14 +142,9 @@ def test_whoever_starts_the_page_without_a_secret_address_offers_no_folder():
     assert shown.info and not shown.sidebar.text_input
 
 
-def test_a_name_that_is_nearly_a_command_is_no_file(capsys):
-    assert command(["forcast", "x.csv"]) == 2
-    assert "did you mean battery-calibrate forecast?" in capsys.readouterr().err
-
-
-def test_without_streamlit_the_command_says_what_to_install(monkeypatch, capsys):
+def test_without_streamlit_the_command_says_what_to_install(monkeypatch, terminal):
     monkeypatch.setattr("battery_env.lab.command_line.find_spec", lambda name: None)
-    assert command(["page"]) == 2 and "pip install 'battery_env[page]'" in capsys.readouterr().err
+    assert "pip install 'battery_env[page]'" in terminal.refuses("page")
 
 
 def test_the_page_opens_without_a_question_and_answers_nobody_without_its_address(start_page):

@@ -20,7 +20,6 @@ from battery_env import (
     evaluate,
     load_nasa_discharges,
 )
-from battery_env.__main__ import calibrate as command
 from battery_env.estimates import last_estimate
 from battery_env.loads import Load
 from battery_env.policies.pretrained import file_stem, pretrained_card, pretrained_policy
@@ -163,13 +162,12 @@ class TestDamage:
                 except ValueError as error:
                     assert "is damaged, or not the policy" in str(error)
 
-    def test_the_command_refuses_them_too(self, copies, capsys):
+    def test_the_command_refuses_them_too(self, copies, terminal):
         for path in copies.glob("*.onnx"):
             content = bytearray(path.read_bytes())
             content[len(content) // 2] ^= 4
             path.write_bytes(content)
-        assert command(["B0005:100", "--method", "policy"]) == 2
-        assert "is damaged" in capsys.readouterr().err
+        assert "is damaged" in terminal.refuses("B0005:100", "--method", "policy")
 
     @pytest.mark.parametrize("text", ["{", "[]", "{}", "null", '{"sha256": 3}'[:-1], '{"options": {}}'])
     def test_a_file_of_the_same_name_that_is_no_card_is_none_of_its_business(self, copies, text):

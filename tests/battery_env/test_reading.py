@@ -430,12 +430,11 @@ def test_a_refused_file_shows_the_command_that_reads_it(tmp_path, capsys):
     assert command([str(path), "--columns", stated, "--ignore", "batt_mV"]) == 2
 
 
-def test_a_tester_is_told_by_its_names_or_added_by_a_file(tmp_path, capsys, monkeypatch):
+def test_a_tester_is_told_by_its_names_or_added_by_a_file(tmp_path, monkeypatch, terminal):
     monkeypatch.chdir(tmp_path)
     table = pd.DataFrame({"Clock": RECORD.time_s / 60.0, "Pole(V)": RECORD.voltage_V, "Load": -1e3 * RECORD.current_A})
     table.to_csv("cell.csv", index=False)
-    assert command(["columns", "cell.csv"]) == 3
-    shown = capsys.readouterr().out
+    shown = terminal.shows("columns", "cell.csv", status=3)
     assert "header      Clock, Pole(V), Load" in shown and "row 2       0.157" in shown and "time        not found" in shown
     text = Path("my_tester.toml").read_text()
     for name, value in (("time", "Clock"), ("voltage", "Pole"), ("current", "Load")):
@@ -446,8 +445,7 @@ def test_a_tester_is_told_by_its_names_or_added_by_a_file(tmp_path, capsys, monk
     near(read("cell.csv", tester="my_tester.toml"))
     assert command(["cell.csv", "--tester", "my_tester.toml"]) == 0
     assert calibrate("cell.csv", tester="my_tester.toml")[0].settled
-    assert command(["columns", "cell.csv"]) == 2  # nothing is overwritten
-    assert "my_tester.toml would be replaced" in capsys.readouterr().err
+    assert "my_tester.toml would be replaced" in terminal.refuses("columns", "cell.csv")
     faults = (("a = 1", "a tester has name"), ("[columns", "in TOML"), ("[columns]\nx='y'", "by quantity"))
     for content, said in faults:
         Path("bad.toml").write_text(content)

@@ -193,34 +193,32 @@ def test_no_command_touches_what_another_one_wrote_to_the_same_folder(first, end
         owners |= {file: name for file in after if file not in owners}
 
 
-def test_another_command_is_told_what_is_there_and_may_replace_it(quick, pair, capsys):
+def test_another_command_is_told_what_is_there_and_may_replace_it(quick, pair, capsys, terminal):
     assert command("lab --out out".split()) == 0
     for second, said in (
         ("other", f"estimate.jsonl is of a command that reads {pair}/lab; choose another --out, or give --force"),
         ("lab --nominal 2", "estimate.jsonl is of a command with another nominal_Ah; choose"),
         ("other --ignore x", f"that reads {pair}/lab with another ignore; choose"),
     ):
-        capsys.readouterr()
-        assert command(f"{second} --out out".split()) == 2
-        assert said in capsys.readouterr().err
+        assert said in terminal.refuses(*f"{second} --out out".split())
     assert command("other --out out --force".split()) == 0
     assert pd.read_csv("out/estimate.csv")["source"].str.startswith("other").all()
     assert command(f"./other --out ../{pair.name}/out".split()) == 0
     assert "going on: 2 discharges are done" in capsys.readouterr().err
 
 
-def test_a_run_that_has_nothing_to_lose_gives_way_and_what_has_the_name_of_a_result_does_not(quick, pair, capsys):
+def test_a_run_that_has_nothing_to_lose_gives_way_and_what_has_the_name_of_a_result_does_not(quick, pair, terminal):
     assert command("lba --out out".split()) == 2 and set(contents(pair / "out")) == {"estimate.jsonl"}
     Path("out/c1_voltage.csv").write_text("precious")
-    assert command("lab --out out".split()) == 2
-    assert "c1_voltage.csv would be replaced; choose another --out, or give --force" in capsys.readouterr().err
+    refused = terminal.refuses("lab", "--out", "out")
+    assert "c1_voltage.csv would be replaced; choose another --out, or give --force" in refused
     assert Path("out/c1_voltage.csv").read_text() == "precious"
     assert command("lab --out out --force".split()) == 0 and Path("out/c1_voltage.csv").read_text() != "precious"
     # a record among the results
     shutil.copy("lab/c0.csv", "lab/c5.csv")
     shutil.copy("lab/c0.csv", "out/c5_voltage.csv")
-    assert command("lab --out out".split()) == 2 and "c5_voltage.csv would be" in capsys.readouterr().err
-    assert command("lab --out out/c1_voltage.csv".split()) == 2 and "is a file" in capsys.readouterr().err
+    assert "c5_voltage.csv would be" in terminal.refuses("lab", "--out", "out")
+    assert "is a file" in terminal.refuses("lab", "--out", "out/c1_voltage.csv")
 
 
 @pytest.mark.parametrize("left", [1, 0])
@@ -249,13 +247,13 @@ STRANGERS = [b"Dear all", b"", b"{}", b"[]\n", bytes(100), b"\xff\n", b'{"format
 
 
 @pytest.mark.parametrize("content", sweep(*STRANGERS))
-def test_a_file_of_somebody_else_is_left_alone(content, quick, pair, capsys):
+def test_a_file_of_somebody_else_is_left_alone(content, quick, pair, terminal):
     (pair / "out").mkdir()
     run = pair / "out" / "estimate.jsonl"
     run.write_bytes(content)
     for more in ([], ["--force"]):
-        assert command(["lab", "--out", "out", *more]) == 2
-        assert "is no run of battery-calibrate: choose another --out, or move it" in capsys.readouterr().err
+        refused = terminal.refuses("lab", "--out", "out", *more)
+        assert "is no run of battery-calibrate: choose another --out, or move it" in refused
         assert contents(pair / "out") == {"estimate.jsonl": content}
     run.unlink()
     assert command("lab --out out".split()) == 0
@@ -264,10 +262,10 @@ def test_a_file_of_somebody_else_is_left_alone(content, quick, pair, capsys):
     assert command("lab --out out".split()) == 0  # its own, whoever changed it
 
 
-def test_one_command_at_a_time_writes_to_a_folder(quick, pair, capsys):
+def test_one_command_at_a_time_writes_to_a_folder(quick, pair, terminal):
     with locked(Path("out/estimate.jsonl")):
-        assert command("lab --out out".split()) == 2
-        assert "is being written by another command: wait for it, or choose another --out" in capsys.readouterr().err
+        refused = terminal.refuses("lab", "--out", "out")
+        assert "is being written by another command: wait for it, or choose another --out" in refused
     assert not contents(pair / "out") and command("lab/c1.csv --out out".split()) == 0
 
 

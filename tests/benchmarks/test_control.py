@@ -235,15 +235,11 @@ def test_the_exact_solution_is_recognized_and_written(tmp_path, exact_model, cap
     assert text in capsys.readouterr().out and "| 1.000, 1.000 to 1.000 " in text and "| 1.0000 " in text
 
 
-def test_what_noise_costs_is_that_of_roll_outs():
+def test_what_noise_costs_is_the_value_of_the_goal():
     env, gamma = LinearCostEnv(), 0.9
     gain = env.optimal_gain(gamma)
-    rng, states, cost = np.random.default_rng(0), np.zeros((20_000, 2)), 0.0
-    for step in range(150):
-        controls = -states @ gain.T
-        cost += gamma**step * (np.square(states).sum(axis=1) + np.square(controls)[:, 0]).mean()
-        states = states @ env.A.T + controls @ env.B.T + env.noise_std * rng.standard_normal(states.shape)
-    assert linear_cost.noise_cost(gain, gamma) == pytest.approx(cost, rel=0.02)
+    value = env.cost_to_go(np.zeros((1, 2)), np.zeros((1, 1)), gain, gamma)
+    assert linear_cost.noise_cost(gain, gamma) == pytest.approx(value[0])
 
 
 def test_what_a_policy_costs_too_much_is_seen_in_roll_outs():
