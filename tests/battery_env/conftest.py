@@ -13,6 +13,7 @@ import pytest
 
 from battery_env import __file__ as package
 from battery_env.loads import RandomPiecewise
+from battery_env.tasks.voltage.readings import Readings
 from battery_env.trajectories import TrajectoryDataset
 from tests.terminal import Terminal
 
@@ -21,6 +22,11 @@ from tests.terminal import Terminal
 def aged_both():
     """Eight discharges of cells of which both parameters have aged, under steps of the load."""
     return TrajectoryDataset.generate(("q_mobile", "r_o"), 8, RandomPiecewise(), seed=5, r_o_range=(0.1, 0.3))
+
+
+@pytest.fixture(scope="session")
+def readings(aged_both):
+    return Readings.of(aged_both)
 
 
 @pytest.fixture

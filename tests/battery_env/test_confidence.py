@@ -8,22 +8,11 @@ import pytest
 from battery_env import NEW_CELL, PolicyEstimator, RandomSensorErrors, SensorErrors, evaluate, simulate
 from battery_env.records import Samples
 from battery_env.tasks.data import standard_dataset
+from tests.policies import Step
 from tests.sweeps import sweep
 
 ENV_ID = "BatteryVoltageJoint-v0"
 OPTIONS = {"nuisance": 0.2, "reading_s": 2.0}
-
-
-class Step:
-    """A policy that makes a share of the step that the fit in its observation says, and goes some way beyond."""
-
-    def __init__(self, share=1.0, beyond=0.0, columns=slice(102, 104)):
-        self.share, self.beyond, self.columns = share, beyond, columns
-
-    def predict(self, observation, deterministic=False):
-        step = observation[:, self.columns].astype(np.float64)
-        moved = self.share * np.sign(step) * step**2 + self.beyond
-        return np.sign(moved) * np.sqrt(np.abs(moved)), None
 
 
 def whole_discharge(q_mobile=6000.0, r_o=0.15, load_A=1.5, noise_V=0.002, **more):

@@ -12,6 +12,7 @@ from battery_env.tasks.vector_env import CalibrationVectorEnv
 from battery_env.tasks.voltage.fit import Known, found_size, nuisance_step
 from battery_env.tasks.voltage.readings import Readings
 from battery_env.tasks.voltage.voltage_task import VoltageTask
+from tests.policies import Step
 
 UNKNOWNS = ("q_mobile", "r_o", "offset_V", *UNCERTAIN_CONSTANTS)
 KNOWS_NOTHING = (1e6, 1e3, 1e3, *[100.0] * 4)
@@ -101,16 +102,9 @@ class TestTask:
             together, alone = many.step(np.full((3, 2), 0.05))[0], one.step(np.full((1, 2), 0.05))[0]
 
 
-class FollowTheFit:
-    """Makes the step that it is shown."""
-
-    def predict(self, observation, deterministic=False):
-        return observation[:, 102:104], None
-
-
 def test_the_step_alone_is_a_good_calibrator_of_cells_that_are_not_the_model():
     data = TrajectoryDataset.generate(("q_mobile", "r_o"), 8, RandomPiecewise(), seed=1, r_o_range=(0.1, 0.3), mismatch=0.2)
-    estimator = PolicyEstimator(FollowTheFit(), "BatteryVoltageJoint-v0", nuisance=0.2, reading_s=2.0)
+    estimator = PolicyEstimator(Step(), "BatteryVoltageJoint-v0", nuisance=0.2, reading_s=2.0)
     scores = evaluate(estimator, data, SensorErrors(noise_V=0.005), seed=1)
     assert scores["q_mobile_second_half_mape_percent"].mean() < 1.0
     assert scores["r_o_second_half_mape_percent"].mean() < 0.6

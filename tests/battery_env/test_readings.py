@@ -9,11 +9,6 @@ from battery_env.loads import RandomPiecewise
 from battery_env.tasks.voltage.readings import SENSOR_ROWS, Readings, explain
 
 
-@pytest.fixture(scope="module")
-def readings(aged_both):
-    return Readings.of(aged_both)
-
-
 def compare(readings, q_mobile, r_o, count=None, stretches=12):
     """Means of residuals, slopes and ohmic drops, root mean square and last voltage of all discharges."""
     n = len(readings)

@@ -11,7 +11,6 @@ from battery_env import NEW_CELL, Discharge, RandomSensorErrors, TrajectoryDatas
 from battery_env.loads import RandomPiecewise
 from battery_env.tasks.env import CalibrationEnv
 from battery_env.tasks.full_state.full_state_task import BatteryQmax
-from battery_env.tasks.voltage.readings import Readings
 from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES, LARGEST_STEPS, VoltageTask
 
 BOTH = ("q_mobile", "r_o")
@@ -22,11 +21,6 @@ EXACT = {"noise_V": (0.0, 0.0), "offset_V": 0.0}
 @pytest.fixture(scope="module")
 def data(aged_both):
     return aged_both
-
-
-@pytest.fixture(scope="module")
-def readings(data):
-    return Readings.of(data)
 
 
 def generators(n, seed=0):
