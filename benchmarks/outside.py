@@ -9,7 +9,7 @@ LAC beside SAC, TD3 and TQC on tasks of Gymnasium, which nobody here made or tun
 
 Every algorithm has its defaults, but SAC, TD3 and TQC those settings of the RL Zoo that are tuned for a task with at most 50
 thousand steps. ``lac_common`` is LAC with its one setting for control problems, ``lac_higher_start`` has the weight of the
-entropy begin at 1, as SAC does. A policy is judged by its mean action, in 20 episodes that no training starts with. A training
+entropy begin at 1, as SAC does, and the critics of ``lac_square_root`` learn that root. A policy is judged by its mean action, in 20 episodes that no training starts with. A training
 that is done is a row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command goes on from
 there.
 """
@@ -50,12 +50,17 @@ ALGORITHMS = {
     "published_lac": ("LAC as published", "sb3_lac:PublishedLAC"),
     "lac_common": ("LAC, its one setting", "sb3_lac:LAC"),
     "lac_higher_start": ("LAC, entropy from 1", "sb3_lac:LAC"),
+    "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC"),
     "sac": ("SAC", "stable_baselines3:SAC"),
     "td3": ("TD3", "stable_baselines3:TD3"),
     "tqc": ("TQC", "sb3_contrib:TQC"),
 }
-_SETTINGS = {"lac_common": setting_of_lac(), "lac_higher_start": {"ent_coef": "auto"}}
-OURS = ("lac", "lac_higher_start")
+_SETTINGS = {
+    "lac_common": setting_of_lac(),
+    "lac_higher_start": {"ent_coef": "auto"},
+    "lac_square_root": {"policy_kwargs": "dict(root=2)"},
+}
+OURS = ("lac", "lac_square_root")
 RIVALS = ("sac", "td3", "tqc")
 _CAR = {
     "learning_rate": 3e-4,
