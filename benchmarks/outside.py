@@ -8,10 +8,10 @@ LAC beside SAC, TD3 and TQC on tasks of Gymnasium, which nobody here made or tun
   python -m benchmarks.outside --merge rows/runs.csv --redraw
 
 Every algorithm has its defaults, but SAC, TD3 and TQC those settings of the RL Zoo that are tuned for a task with at most 50
-thousand steps. ``lac_common`` is LAC with its one setting for control problems, ``lac_higher_start`` has the weight of the
-entropy begin at 1, as SAC does, and the critics of ``lac_square_root`` learn that root. A policy is judged by its mean action, in 20 episodes that no training starts with. A training
-that is done is a row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command goes on from
-there.
+thousand steps. ``lac_common`` is LAC with its one setting for control problems. The weight of the entropy begins at 1 in
+``lac_higher_start``, as SAC's does, and the critics of ``lac_square_root`` learn that root. A policy is judged by its mean
+action, in 20 episodes that no training starts with. A training that is done is a row of ``runs.csv``, which nothing but a
+change of what was run makes anew. The same command goes on from there.
 """
 
 from __future__ import annotations
@@ -44,21 +44,16 @@ TASKS = {
     "Pusher-v5": 10_000,
     "Hopper-v5": 50_000,
 }
-#: Algorithms by their names on the command line: what readers call them, and the class.
-ALGORITHMS = {
-    "lac": ("LAC", "sb3_lac:LAC"),
-    "published_lac": ("LAC as published", "sb3_lac:PublishedLAC"),
-    "lac_common": ("LAC, its one setting", "sb3_lac:LAC"),
-    "lac_higher_start": ("LAC, entropy from 1", "sb3_lac:LAC"),
-    "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC"),
-    "sac": ("SAC", "stable_baselines3:SAC"),
-    "td3": ("TD3", "stable_baselines3:TD3"),
-    "tqc": ("TQC", "sb3_contrib:TQC"),
-}
-_SETTINGS = {
-    "lac_common": setting_of_lac(),
-    "lac_higher_start": {"ent_coef": "auto"},
-    "lac_square_root": {"policy_kwargs": "dict(root=2)"},
+#: Algorithms by their names on the command line: what readers call them, the class, and what differs from its defaults.
+ALGORITHMS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "lac": ("LAC", "sb3_lac:LAC", {}),
+    "published_lac": ("LAC as published", "sb3_lac:PublishedLAC", {}),
+    "lac_common": ("LAC, its one setting", "sb3_lac:LAC", setting_of_lac()),
+    "lac_higher_start": ("LAC, entropy from 1", "sb3_lac:LAC", {"ent_coef": "auto"}),
+    "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC", {"policy_kwargs": "dict(root=2)"}),
+    "sac": ("SAC", "stable_baselines3:SAC", {}),
+    "td3": ("TD3", "stable_baselines3:TD3", {}),
+    "tqc": ("TQC", "sb3_contrib:TQC", {}),
 }
 OURS = ("lac", "lac_square_root")
 RIVALS = ("sac", "td3", "tqc")
@@ -101,8 +96,8 @@ RETURN = _CURVE[100]
 
 def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -> Run:
     """A training of this study."""
-    settings = _SETTINGS.get(algorithm) or TUNED.get(task, {}).get(algorithm, {})
-    return Run(task, algorithm, ALGORITHMS[algorithm][1], seed, timesteps or TASKS[task], settings)
+    _, kind, settings = ALGORITHMS[algorithm]
+    return Run(task, algorithm, kind, seed, timesteps or TASKS[task], TUNED.get(task, {}).get(algorithm, settings))
 
 
 def mean_return(model: OffPolicyAlgorithm, run: Run) -> float:
@@ -157,7 +152,7 @@ def comparison(rows: pd.DataFrame) -> pd.DataFrame:
 
 def report(rows: pd.DataFrame, compared: pd.DataFrame) -> str:
     """The returns and the comparison, as Markdown."""
-    shown = {name: label for name, (label, _) in ALGORITHMS.items() if name in set(rows["algorithm"])}
+    shown = {name: label for name, (label, *_) in ALGORITHMS.items() if name in set(rows["algorithm"])}
     returns = [
         {"task": task, "steps": str(of_task["timesteps"].max()), "seeds": str(of_task["seed"].nunique())}
         | {
@@ -195,7 +190,7 @@ def plot_learning(rows: pd.DataFrame) -> Figure:
     figure, panels = new_panels(len(tasks), 4, (3.1, 2.3), margin=(0.0, 0.4))
     for axes, task in zip(panels, tasks, strict=True):
         of_task = rows[rows["task"] == task]
-        for colour, (label, name) in coloured((label, name) for name, (label, _) in ALGORITHMS.items()):
+        for colour, (label, name) in coloured((label, name) for name, (label, *_) in ALGORITHMS.items()):
             own = of_task[of_task["algorithm"] == name]
             if len(own):
                 steps = np.array(list(_CURVE)) / 100 * own["timesteps"].iloc[0]
