@@ -34,8 +34,8 @@ class LAC(CostAlgorithm):
       model.save("lac_cart_pole")
 
     Pay costs as they are, ``reward = -cost``, and let a failure have its price. Choose the discount, the learning rate and the
-    number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. Take SAC where chance decides on
-    rare events that cost a lot: a mean of roots underrates them.
+    number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. Where chance decides on rare
+    events that cost a lot a mean of roots underrates them: take SAC, or ``policy_kwargs=dict(root=2)``.
 
     The critic ``L(s, a) >= 0`` is the discounted sum of costs. It has to decrease by ``alpha3`` times the cost in each step: a
     Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up as in SAC.

@@ -218,11 +218,16 @@ class LyapunovPolicy(SACPolicy):
 
       model = LAC("MlpPolicy", "LinearCost-v0", policy_kwargs=dict(net_arch=[64, 64], n_critics=1))
 
-    :param args: Arguments of SAC's policy, spaces and the schedule of the learning rate first
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: The specification of the policy and Lyapunov networks.
     :param root: Which root of ``L`` the critics learn, 4 (the default) or 2. The square root has less bias where chance, or
         what no observation tells, decides on costs; small costs count less beside large ones.
-    :param kwargs: The other arguments of SAC's policy, among them ``n_critics``, of whose values the largest is used. Adam is
-        the fused one, unless ``optimizer_kwargs`` has ``fused``, ``foreach`` or ``differentiable``.
+    :param kwargs: The other arguments of ``SACPolicy``: ``activation_fn``, ``use_sde``, ``log_std_init``, ``use_expln``,
+        ``clip_mean``, ``features_extractor_class``, ``features_extractor_kwargs``, ``normalize_images``, ``optimizer_class``,
+        ``optimizer_kwargs`` (Adam is the fused one, unless they have ``fused``, ``foreach`` or ``differentiable``),
+        ``n_critics`` (the largest of their values is used) and ``share_features_extractor``
     """
 
     critic: LyapunovCritic  # type: ignore[assignment]
@@ -231,9 +236,17 @@ class LyapunovPolicy(SACPolicy):
     reward_bound: th.Tensor
     critic_class: ClassVar[type[LyapunovCritic]] = RootCritic
 
-    def __init__(self, *args: Any, root: int | None = None, **kwargs: Any):
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        root: int | None = None,
+        **kwargs: Any,
+    ):
         self.root = root
-        super().__init__(*args, **kwargs)
+        super().__init__(observation_space, action_space, lr_schedule, net_arch, **kwargs)
 
     def _build(self, lr_schedule: Schedule) -> None:
         # Other implementations of Adam exclude the fused one
