@@ -317,7 +317,11 @@ constants are off, and by how much. Least squares and filters read every second,
     work=_held_out,
 )
 
-COMPARISONS = {"peers": _PEERS, "faults": _FAULTS, "mismatch": _MISMATCH}
+COMPARISONS = {
+    "peers": _PEERS,
+    "faults": _FAULTS,
+    "mismatch": _MISMATCH,
+}
 
 
 def cpu_time_per_estimate_s(estimator: Estimator, data: TrajectoryDataset, slow: bool) -> float:

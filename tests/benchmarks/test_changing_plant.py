@@ -50,12 +50,12 @@ def test_cells_are_counted_where_lac_is_ahead_or_level_with_those_that_saw_the_s
         return changing_plant.cells_held(pd.DataFrame(rows), ["none", "impulses"], ours)
 
     rows = [row(name, seed, cost) for name, cost in (("LAC", 1.01), ("SAC", 1.0), ("TQC", 3.0)) for seed in (1, 2)]
-    assert held(rows) == "LAC in 2 of 2"
+    assert held(rows) == "LAC: 2 of 2"
     rows += [row(f"{name}, 2 last actions", 1, cost) for name, cost in (("LAC", 1.03), ("SAC", 1.0), ("TQC", 3.0))]
-    assert held(rows) == "LAC in 2 of 4"
-    assert held([*rows, row("LAC (root=2)", 1, 0.9)], "LAC (root=2)") == "LAC (root=2) in 2 of 2"
-    assert held(rows[:4]) == "LAC in 2 of 2"  # of SAC alone
-    assert held(rows[:2]) == "LAC in 0 of 0"
+    assert held(rows) == "LAC: 2 of 2" and held(rows, "LAC, 2 last actions") == "LAC, 2 last actions: 0 of 2"
+    assert held([*rows, row("LAC (root=2)", 1, 0.9)], "LAC (root=2)") == "LAC (root=2): 2 of 2"
+    assert held(rows[:4]) == "LAC: 2 of 2"  # of SAC alone
+    assert held(rows[:2]) == "LAC: 0 of 0"
     table = changing_plant.cost_table(pd.DataFrame([row("LAC", 1, 2.0, 0.5), row("LAC", 2, 4.0)]), ["outside: impulses"])
     assert table.to_dict("records") == [
         {"environment": "CartPoleCost-v0", "policy": "LAC", "seeds": "2", "impulses": "3 [2, 4] (25 %)"}
@@ -73,4 +73,8 @@ def test_the_study_trains_and_writes(tmp_path, monkeypatch, capsys):
     assert done["algorithm"].tolist() == ["LAC", "SAC", "LAC, 2 last actions", "SAC, 2 last actions"]
     assert np.isfinite(done[["none", "action delay", "outside: action delay", "after_100_percent"]].to_numpy()).all()
     text = (tmp_path / "changing_plant.md").read_text()
-    assert text.count("| CartPoleCost-v0 | LAC, 2 last actions") == 2 and "LAC in " in text and text in capsys.readouterr().out
+    assert (
+        text.count("| CartPoleCost-v0 | LAC, 2 last actions") == 2
+        and "LAC, 2 last actions: " in text
+        and text in capsys.readouterr().out
+    )
