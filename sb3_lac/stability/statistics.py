@@ -120,28 +120,25 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray, late_cost
     The Foster-Lyapunov condition ``E[L' - L] <= -alpha3 * c + b`` at each level of the cost, with the alpha3 and b that say
     most: those with the least ``b / alpha3``, which bounds the mean cost in the long run.
     """
-    shape = np.shape(n)[:-1]
-    bounds, alphas = np.empty(shape), np.empty(shape)
-    for index in np.ndindex(shape):
-        seen = n[index] > 0
-        if not seen.any():
-            bounds[index] = alphas[index] = np.nan
-            continue
-        m, c = drift[index][seen] / n[index][seen], cost[index][seen] / n[index][seen]
-        late = np.asarray(late_cost)[index]
-        least = c.min() if np.isnan(late) else late
-        # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0, or where
-        # two of them meet, or where the last one reaches that cost, or 0
-        with np.errstate(divide="ignore", invalid="ignore"):
-            meetings = np.concatenate([((c[:, None] - c) / (m - m[:, None])).ravel(), (least - c) / m, -c / m])
-        t = np.sort(np.append(0.0, meetings[np.isfinite(meetings) & (meetings > 0)]))
-        if (m[c == c.max()] < 0).all() and len(t) > 1:
-            t = t[1:]  # where L falls at the largest cost, an infinite alpha3 says no more than others
-        of_t = np.maximum((np.outer(t, m) + c).max(axis=1), least)
+    seen, late_cost = np.asarray(n) > 0, np.asarray(late_cost)
+    # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0, or where
+    # two of them meet, or where the last one reaches that cost, or 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        m, c = drift / n, cost / n
+        least = np.where(np.isnan(late_cost), np.where(seen, c, np.inf).min(axis=-1), late_cost)[..., None]
+        of_pairs = (c[..., :, None] - c[..., None, :]) / (m[..., None, :] - m[..., :, None])
+        meetings = np.concatenate([of_pairs.reshape((*seen.shape[:-1], -1)), (least - c) / m, -c / m], axis=-1)
+        meetings = np.sort(np.where(np.isfinite(meetings) & (meetings > 0), meetings, np.inf))
+        # where L falls at the largest cost, an infinite alpha3 says no more than others
+        falls = ((m < 0) | (c != np.where(seen, c, -np.inf).max(axis=-1, keepdims=True))).all(axis=-1, keepdims=True)
+        t = np.concatenate([np.where(falls & np.isfinite(meetings[..., :1]), np.inf, 0.0), meetings], axis=-1)
+        lines = np.where(seen[..., None, :], t[..., None] * m[..., None, :] + c[..., None, :], -np.inf)
+        of_t = np.where(np.isfinite(t), np.maximum(lines.max(axis=-1), least), np.inf)
         # The largest alpha3 of those that say as much
-        best = np.argmax(of_t <= of_t.min() * (1 + 1e-12))
-        bounds[index], alphas[index] = of_t[best], 1 / t[best] if t[best] > 0 else np.nan
-    return bounds, alphas
+        best = np.argmax(of_t <= of_t.min(axis=-1, keepdims=True) * (1 + 1e-12), axis=-1, keepdims=True)
+        bounds, t_best = (np.take_along_axis(values, best, axis=-1)[..., 0] for values in (of_t, t))
+        defined = seen.any(axis=-1) & np.isfinite(np.where(seen, m + c, 0.0)).all(axis=-1)
+        return np.where(defined, bounds, np.nan), np.where(defined & (t_best > 0), 1 / t_best, np.nan)
 
 
 def levels_of_cost(known: pd.DataFrame) -> np.ndarray:

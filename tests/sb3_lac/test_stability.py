@@ -439,9 +439,9 @@ def test_callbacks_of_stable_baselines3_stop_a_training_after_an_evaluation(make
     assert model.learn(100, callback=callback).num_timesteps == 30
     rewards = callback.last_report.transitions.groupby("episode")["reward"].sum()
     assert callback.best_mean_reward == pytest.approx(rewards.mean())
-    for threshold, steps in ((callback.best_mean_reward - 0.1, 10), (callback.best_mean_reward + 0.1, 40)):
+    for threshold, steps in ((callback.best_mean_reward - 0.1, 10), (callback.best_mean_reward + 0.1, 20)):
         stop = StopTrainingOnRewardThreshold(threshold)
-        assert model.learn(40, callback=make_callback(make_env(), stop, **options)).num_timesteps == steps
+        assert model.learn(20, callback=make_callback(make_env(), stop, **options)).num_timesteps == steps
 
 
 @pytest.mark.filterwarnings("ignore:Observations lie far")

@@ -265,18 +265,18 @@ def test_no_gradient_step_changes_nothing(make_model, train_metrics):
     ("algorithm", "kwargs"),
     sweep(
         (LAC, {}),
-        *((PublishedLAC, {"critic_learning_rate": 3e-3, "horizon": horizon}) for horizon in (None, 5)),
+        *((PublishedLAC, {"critic_learning_rate": 1e-2, "horizon": horizon}) for horizon in (None, 5)),
     ),
 )
 def test_it_learns_to_control(make_model, make_env, algorithm, kwargs):
     def mean_cost():
         return evaluate_lyapunov(model, make_env(n_dim=1), 10, seed=1000).metrics["mean_cost"].value
 
-    options = {"learning_rate": 3e-3, "gamma": 0.9, "tau": 0.02, "buffer_size": 2000, **kwargs}
+    options = {"learning_rate": 1e-2, "gamma": 0.9, "tau": 0.05, **kwargs}
     model = make_model(make_env(n_dim=1), n_collect=0, algorithm=algorithm, **options)
     before = mean_cost()
-    model.learn(1000)
-    # Doing nothing costs 1.15 per step, the best controller 0.09
+    model.learn(300)
+    # Doing nothing costs 1.15 per step, the best controller 0.09. Four seeds of LAC reached 0.06 to 0.10
     assert before > 0.6 and mean_cost() < 0.2
 
 
