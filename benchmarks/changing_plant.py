@@ -87,10 +87,8 @@ def run_of(env_id: str, algorithm: str, seed: int, last_actions: int = 0, timest
     environment = {"drawn": drawn(env_id), "impulse_interval": IMPULSE_INTERVAL}
     if last_actions:
         label, environment["last_actions"] = f"{label}, {last_actions} last actions", last_actions
-    setting = setting_of_lac()
-    if algorithm == "lac_square_root":
-        setting["policy_kwargs"] = setting["policy_kwargs"].removesuffix(")") + ", root=2)"
-    return Run(env_id, label, kind, seed, timesteps or TIMESTEPS, setting, environment)
+    root = {"lac": 4, "lac_square_root": 2}.get(algorithm)
+    return Run(env_id, label, kind, seed, timesteps or TIMESTEPS, setting_of_lac(root), environment)
 
 
 def cost_while_training(model: OffPolicyAlgorithm, run: Run) -> float:

@@ -45,9 +45,10 @@ _KEY = ["task", "algorithm", "seed", "timesteps", "package", "configuration"]
 _SETTING_OF_LAC = Path(__file__).parents[1] / "zoo_configs" / "lac.yml"
 
 
-def setting_of_lac() -> dict[str, Any]:
-    """The one setting of LAC for all control problems, without its number of steps."""
+def setting_of_lac(root: int | None = 4) -> dict[str, Any]:
+    """The one setting of LAC for all control problems, without its number of steps; other algorithms have no root."""
     entry = yaml.safe_load(_SETTING_OF_LAC.read_text(encoding="utf-8"))["default"]
+    entry["policy_kwargs"] = entry["policy_kwargs"].replace(", root=4", "" if root is None else f", root={root}")
     return {name: value for name, value in entry.items() if name not in ("policy", "n_timesteps")}
 
 

@@ -11,10 +11,10 @@ costs, whether it ends at the goal, what disturbances that it was not trained fo
 Policies are trained without disturbances, with the hyperparameters of ``zoo_configs``, and judged by their mean action. All of
 them have the same starts and disturbances. ``sac_common``, ``td3_common`` and ``tqc_common`` have the one setting of LAC for
 all problems in place of their own for each; ``published_lac`` has it too, and ``published_lac_paper`` that of its authors.
-``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is LAC's from what is the metric's. What is
-done is not done again when the command is repeated, so that seeds can be added. Without algorithms only controllers are
-judged, which takes minutes; with ``--weak-controllers`` also those with too little gain or the wrong sign, of which a
-certificate must not say that they settle.
+``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is LAC's from what is the metric's. Critics of
+``lac_square_root`` learn that root, and those of ``lac`` the fourth. What is done is not done again when the command is
+repeated, so that seeds can be added. Without algorithms only controllers are judged, which takes minutes; with
+``--weak-controllers`` also those with too little gain or the wrong sign, of which a certificate must not say that they settle.
 ``tensorboard --logdir results/stabilisation/models`` overlays the curves of all trainings.
 """
 
@@ -53,6 +53,7 @@ from benchmarks.control import (
     shares_of,
     tried,
 )
+from benchmarks.runs import setting_of_lac
 from benchmarks.study import (
     Cell,
     Study,
@@ -128,10 +129,13 @@ class Trained(NamedTuple):
 
 REFERENCE = "reference"
 _METRIC_SAC = "benchmarks.metric_sac:MetricSAC"
+_SQUARE_ROOT = {"policy_kwargs": setting_of_lac(root=2)["policy_kwargs"]}
+_NETWORKS = {"policy_kwargs": setting_of_lac(root=None)["policy_kwargs"]}
 _NOISE = {"noise_type": "normal", "noise_std": 0.1}
 #: Who is judged, by the name on the command line.
 CONTENDERS = {
     "lac": Contender("lac", "LAC", COLOUR_OF["LAC"], "o", compiles=True),
+    "lac_square_root": Contender("lac", "LAC (root=2)", COLOUR_OF["LAC"], "d", None, _SQUARE_ROOT, compiles=True),
     "published_lac": Contender("published_lac", "LAC as published", COLOUR_OF["LAC as published"], "P", compiles=True),
     "published_lac_paper": Contender(
         "published_lac",
@@ -142,11 +146,11 @@ CONTENDERS = {
         compiles=True,
     ),
     "sac": Contender("sac", "SAC", COLOUR_OF["SAC"], "s"),
-    "sac_common": Contender("sac", "SAC, LAC's setting", COLOUR_OF["SAC"], "8", settings="lac"),
+    "sac_common": Contender("sac", "SAC, LAC's setting", COLOUR_OF["SAC"], "8", "lac", _NETWORKS),
     "td3": Contender("td3", "TD3", COLOUR_OF["TD3"], "^"),
-    "td3_common": Contender("td3", "TD3, LAC's setting", COLOUR_OF["TD3"], ">", settings="lac", hyperparameters=_NOISE),
+    "td3_common": Contender("td3", "TD3, LAC's setting", COLOUR_OF["TD3"], ">", "lac", {**_NETWORKS, **_NOISE}),
     "tqc": Contender("tqc", "TQC", COLOUR_OF["TQC"], "D"),
-    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "*", settings="lac"),
+    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "*", "lac", _NETWORKS),
     "metric_sac": Contender(_METRIC_SAC, "SAC, LAC's metric", COLOURS[4], "v", compiles=True),
 }
 #: How they are drawn: colour and marker.

@@ -68,7 +68,7 @@ class Actor(nn.Module):
 
 class Critic(nn.Module):
     """
-    Networks that learn the fourth root ``f`` of what ``L``, the discounted sum of costs, is above a floor: all levels of the
+    Networks that learn the square root ``f`` of what ``L``, the discounted sum of costs, is above a floor: all levels of the
     cost count then, from that of a crash to that of a loop at rest.
     """
 
@@ -85,17 +85,12 @@ class Critic(nn.Module):
 
 
 def root(value: th.Tensor) -> th.Tensor:
-    """What a critic learns of a value above the floor, with its sign."""
-    return value.sign() * value.abs().pow(0.25)
+    """What a critic learns of a value above the floor, with its sign: a distance where the value is like a square."""
+    return value.sign() * value.abs().sqrt()
 
 
-def fourth_power(f: th.Tensor) -> th.Tensor:
+def square(f: th.Tensor) -> th.Tensor:
     """The value above the floor."""
-    return f.sign() * f.pow(4)
-
-
-def distance(f: th.Tensor) -> th.Tensor:
-    """The square root of that value, a distance from the goal where the value is like its square."""
     return f * f.abs()
 
 
@@ -120,7 +115,7 @@ class LAC:
         with th.no_grad():
             next_actions = self.actor(batch.next_observations)
             next_roots = self.critic_target(batch.next_observations, next_actions).amax(dim=0)
-            next_values = (fourth_power(next_roots) + self.critic_target.floor).clamp(min=0.0)
+            next_values = (square(next_roots) + self.critic_target.floor).clamp(min=0.0)
             targets = batch.costs + settings.gamma * (1.0 - batch.terminated) * next_values
             self.critic.floor.lerp_(targets.min(), settings.tau)
             target_roots = root(targets - self.critic.floor)
@@ -129,13 +124,13 @@ class LAC:
 
         # 2. By how much the decrease condition L(s', a') <= L(s, a) - alpha3 c is violated, where the episode goes on
         with th.no_grad():
-            next_distance = distance(self.critic(batch.next_observations, next_actions).amax(dim=0))
-            allowed = fourth_power(roots.amax(dim=0)) - settings.alpha3 * batch.costs
+            next_root = self.critic(batch.next_observations, next_actions).amax(dim=0)
+            allowed = square(roots.amax(dim=0)) - settings.alpha3 * batch.costs
             going_on = 1.0 - batch.terminated
-            violation = (going_on * (next_distance - distance(root(allowed)))).sum() / going_on.sum().clamp(min=1.0)
+            violation = (going_on * (next_root - root(allowed))).sum() / going_on.sum().clamp(min=1.0)
 
-        # 3. The actor lowers the distance from the goal, and keeps its entropy
-        objective = distance(self.critic(batch.observations, actions_pi).amax(dim=0)).mean()
+        # 3. The actor lowers the root, and keeps its entropy
+        objective = self.critic(batch.observations, actions_pi).amax(dim=0).mean()
         lambda_, ent_coef = self.log_lambda.detach().exp(), self.log_ent_coef.detach().exp()
         actor_loss = lambda_ * objective + ent_coef * log_prob.mean()
 

@@ -150,13 +150,13 @@ class SumOfSquaresCritic(LyapunovCritic):
 
 class RootCritic(LyapunovCritic):
     """
-    Lyapunov critic of ``LAC``: each network learns the fourth root ``f(s, a)`` of what ``L`` is above its floor, about the
-    value of the loop at rest: ``L = offset + floor + sign(f) |f|^4``. The arguments are those of ``LyapunovCritic``, and
-    ``root=2`` for the square root.
+    Lyapunov critic of ``LAC``: each network learns a root ``f(s, a)`` of what ``L`` is above its floor, about the value of the
+    loop at rest: ``L = offset + floor + sign(f) |f|^root``. The arguments are those of ``LyapunovCritic``, and ``root``: 2, or
+    4, that of files which name none (before sb3_lac 0.7).
 
     Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` is a thousand times larger at a
-    thousand times the cost, and one of ``f`` less than six times. The unit of the costs is nothing but a factor of ``f``. With
-    noise ``L`` is biased low: the root of a mean is larger than the mean of the roots.
+    thousand times the cost, and one of a square root 32 times, of a fourth root less than six times. The unit of the costs is
+    nothing but a factor of ``f``. With noise ``L`` is biased low: the root of a mean is larger than the mean of the roots.
 
     The floor follows the lowest value. What all values have in common falls slowly while the loop gets better, if the discount
     is near 1: a root from zero on would be flat just where the loop comes to rest. What is learned is a relative value, as in
@@ -168,7 +168,7 @@ class RootCritic(LyapunovCritic):
 
     def __init__(self, *args: Any, root: int = 4, **kwargs: Any):
         if root not in (2, 4):
-            raise ValueError(f"root={root} must be 4, of the fourth root, or 2, of the square root.")
+            raise ValueError(f"root={root} must be 2, of the square root, or 4, of the fourth root.")
         super().__init__(*args, **kwargs)
         self.degree = root
         # What all values have in common. Set by the algorithm, saved with the weights
@@ -222,8 +222,8 @@ class LyapunovPolicy(SACPolicy):
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule (could be constant)
     :param net_arch: The specification of the policy and Lyapunov networks.
-    :param root: Which root of ``L`` the critics learn, 4 (the default) or 2. The square root has less bias where chance, or
-        what no observation tells, decides on costs; small costs count less beside large ones.
+    :param root: Which root of ``L`` the critics learn, 2 (the default of ``LAC``) or 4. Small costs count more beside large
+        ones to the fourth root; the square root has less bias where chance, or what no observation tells, decides on costs.
     :param kwargs: The other arguments of ``SACPolicy``: ``activation_fn``, ``use_sde``, ``log_std_init``, ``use_expln``,
         ``clip_mean``, ``features_extractor_class``, ``features_extractor_kwargs``, ``normalize_images``, ``optimizer_class``,
         ``optimizer_kwargs`` (Adam is the fused one, unless they have ``fused``, ``foreach`` or ``differentiable``),

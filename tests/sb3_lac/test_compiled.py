@@ -100,7 +100,7 @@ def seen(env):
             {"ent_coef": 0.2, "reward_bound": 3.0, "n_steps": 3},
             {
                 "policy_kwargs": {
-                    **{"net_arch": [16, 16], "n_critics": 2, "root": 2},
+                    **{"net_arch": [16, 16], "n_critics": 2, "root": 4},
                     **{"optimizer_class": th.optim.SGD, "share_features_extractor": True},
                 }
             },
