@@ -138,12 +138,7 @@ CONTENDERS = {
     "lac_square_root": Contender("lac", "LAC (root=2)", COLOUR_OF["LAC"], "d", None, _SQUARE_ROOT, compiles=True),
     "published_lac": Contender("published_lac", "LAC as published", COLOUR_OF["LAC as published"], "P", compiles=True),
     "published_lac_paper": Contender(
-        "published_lac",
-        "LAC as published, its setting",
-        COLOUR_OF["LAC as published"],
-        "X",
-        settings="published_lac",
-        compiles=True,
+        "published_lac", "LAC as published, its setting", COLOUR_OF["LAC as published"], "X", "published_lac", compiles=True
     ),
     "sac": Contender("sac", "SAC", COLOUR_OF["SAC"], "s"),
     "sac_common": Contender("sac", "SAC, LAC's setting", COLOUR_OF["SAC"], "8", "lac", _NETWORKS),

@@ -23,7 +23,7 @@ class LAC(CostAlgorithm):
     It changes the published algorithm, which is ``PublishedLAC``. Two critics learn the square root of what ``L`` is above its
     lowest value, in which small costs count beside large ones; the published one learns ``L`` itself, as a sum of squares. The
     actor lowers that root in the sampled states; the published one lowers the condition on ``L``, in the next states. Targets
-    have the mean action of the actor; the published ones have sampled actions of a target actor.
+    have the mean action of the actor; the published ones sampled actions of a target actor.
 
     .. code-block:: python
 
@@ -34,9 +34,8 @@ class LAC(CostAlgorithm):
       model.save("lac_cart_pole")
 
     Pay costs as they are, ``reward = -cost``, and let a failure have its price. Choose the discount, the learning rate and the
-    number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. Where chance decides on rare
-    events that cost a lot a mean of roots underrates them: take SAC. Where the plant is known, and a loop has to settle as
-    near to its goal as it can, try ``policy_kwargs=dict(root=4)``.
+    number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. Rare events that cost a lot are
+    underrated: take SAC. Where a loop has to settle near its goal on a known plant, try ``policy_kwargs=dict(root=4)``.
 
     The critic ``L(s, a) >= 0`` is the discounted sum of costs. It has to decrease by ``alpha3`` times the cost in each step: a
     Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up as in SAC.
@@ -192,7 +191,7 @@ class LAC(CostAlgorithm):
             sde_sample_freq=sde_sample_freq,
             use_sde_at_warmup=use_sde_at_warmup,
         )
-        # What a file of a model names. One that names none is of before sb3_lac 0.7, whose root was the fourth
+        # Files name it. Those that do not are of before sb3_lac 0.7, when it was the fourth
         self.policy_kwargs = {"root": 2, **self.policy_kwargs}
         if _init_setup_model:
             self._setup_model()

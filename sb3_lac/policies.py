@@ -151,8 +151,7 @@ class SumOfSquaresCritic(LyapunovCritic):
 class RootCritic(LyapunovCritic):
     """
     Lyapunov critic of ``LAC``: each network learns a root ``f(s, a)`` of what ``L`` is above its floor, about the value of the
-    loop at rest: ``L = offset + floor + sign(f) |f|^root``. The arguments are those of ``LyapunovCritic``, and ``root``: 2, or
-    4, that of files which name none (before sb3_lac 0.7).
+    loop at rest: ``L = offset + floor + sign(f) |f|^root``. Files that name no root are of before sb3_lac 0.7: the fourth.
 
     Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` is a thousand times larger at a
     thousand times the cost, and one of a square root 32 times, of a fourth root less than six times. The unit of the costs is
@@ -160,8 +159,7 @@ class RootCritic(LyapunovCritic):
 
     The floor follows the lowest value. What all values have in common falls slowly while the loop gets better, if the discount
     is near 1: a root from zero on would be flat just where the loop comes to rest. What is learned is a relative value, as in
-    relative value iteration. Where rewards are positive, ``L`` also has the ``offset``. The signed root is that of
-    https://arxiv.org/abs/1805.11593, without its linear part.
+    relative value iteration. The signed root is that of https://arxiv.org/abs/1805.11593, without its linear part.
     """
 
     n_outputs = 1
