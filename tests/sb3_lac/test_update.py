@@ -31,12 +31,8 @@ def roots_of(weights, obs, actions, n_critics):
     return th.stack(outputs)
 
 
-def root(value, degree):
+def root(value, degree=2):
     return th.sign(value) * abs(value) ** (1 / degree)
-
-
-def distance(value):
-    return th.sign(value) * th.sqrt(abs(value))
 
 
 def relative(roots, degree):
@@ -120,10 +116,10 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         critic_loss = (0.5 * (roots - root(y - floor, degree)) ** 2).mean(dim=1).sum()
         values = (relative(roots, degree) + floor + offset).clamp(min=0).detach()
         next_roots = roots_of(critic, next_obs, next_actions, n_critics)
-        difference = distance(relative(next_roots, degree)) - distance(relative(roots.detach(), degree) - ALPHA3 * costs)
+        difference = root(relative(next_roots, degree)) - root(relative(roots.detach(), degree) - ALPHA3 * costs)
         # Where the episode goes on
         d = difference[dones == 0].mean()
-        objective = distance(relative(roots_of(critic, obs, actions_pi, n_critics), degree)).mean()
+        objective = root(relative(roots_of(critic, obs, actions_pi, n_critics), degree)).mean()
         lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
         actor_loss = lambda_ * objective + beta * log_prob.mean()
         violation = log_prob.mean().item() - 2.0  # target entropy: minus the number of actions
