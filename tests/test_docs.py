@@ -89,11 +89,15 @@ def run_briefly(source, name, folder, monkeypatch):
     exec(compile(source, name, "exec"), {"__name__": "__main__"})
 
 
+#: What takes as long as a training
+LONG = {"cell_life.md", "compare_calibrators.md", "lac_single_file.py"}
+
+
 def tried(files):
-    """Files with examples. Those that train are tried with the attacks, but for README."""
+    """Files with examples. Those that train or take long are tried with the attacks, but for README."""
     attacks = [pytest.mark.attacks]
-    trains = {file: ".learn(" in file.read_text(encoding="utf-8") and file.name != "README.md" for file in files}
-    return [pytest.param(file, marks=attacks if trains[file] else [], id=file.name) for file in files]
+    trains = {file for file in files if ".learn(" in file.read_text(encoding="utf-8") and file.name != "README.md"}
+    return [pytest.param(file, marks=attacks if file in trains or file.name in LONG else [], id=file.name) for file in files]
 
 
 #: Lines of output that a training of some steps does not reach
@@ -126,6 +130,7 @@ def test_example_files_run(example, tmp_path, monkeypatch):
     run_briefly(example.read_text(encoding="utf-8"), str(example), tmp_path, monkeypatch)
 
 
+@pytest.mark.attacks
 def test_commands_of_the_calibrator_run_and_exit_as_their_page_says(tmp_path, monkeypatch):
     page = ROOT / "docs/command_line.md"
     run_briefly("\n".join(blocks(page, "python")), str(page), tmp_path, monkeypatch)

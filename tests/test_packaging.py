@@ -69,16 +69,12 @@ def test_the_calibrator_is_a_command(wheels):
         assert "battery-calibrate = battery_env.__main__:calibrate" in wheel.read(name).decode()
 
 
-@pytest.fixture(scope="module")
-def installed(wheels, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("installed")
-    for wheel in wheels.values():
-        zipfile.ZipFile(wheel).extractall(folder)
-    return folder
-
-
-def test_what_the_wheels_install_registers_the_batteries_and_finds_hyperparameters_from_any_folder(installed, tmp_path):
+@pytest.mark.attacks
+def test_what_the_wheels_install_registers_the_batteries_and_finds_hyperparameters_from_any_folder(wheels, tmp_path):
     pytest.importorskip("rl_zoo3")
+    installed = tmp_path / "installed"
+    for wheel in wheels.values():
+        zipfile.ZipFile(wheel).extractall(installed)
     code = (
         "import sys, sb3_lac, gymnasium\ngymnasium.spec('BatteryQmax-v0')\nprint(sys.modules['battery_env'].__file__)\n"
         "from sb3_lac.zoo import find_config\nprint(find_config('td3'))\n"

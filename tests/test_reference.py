@@ -85,7 +85,13 @@ def test_what_users_call_first_has_an_example(name):
     assert name in {path.rpartition(".")[2] for path in EXAMPLES}
 
 
-@pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if "import " in example])
+def tried(name):
+    """Examples that train are tried with the attacks, but for that of LAC."""
+    trains = ".learn(" in EXAMPLES[name] and name != "sb3_lac.LAC"
+    return pytest.param(name, marks=pytest.mark.attacks if trains else ())
+
+
+@pytest.mark.parametrize("name", [tried(name) for name, example in EXAMPLES.items() if "import " in example])
 def test_whole_examples_of_docstrings_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(fitting, "N_ITERATIONS", 20)

@@ -56,7 +56,7 @@ def path():
 
 @pytest.fixture(scope="module")
 def b0006():
-    return fit_life(load_nasa_discharges("B0006"))
+    return fit_life(load_nasa_discharges("B0006")[::4])
 
 
 def until(record, share):

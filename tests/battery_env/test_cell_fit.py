@@ -64,7 +64,7 @@ def test_a_fit_tells_how_much_the_cell_holds_before_its_knee_does(b0005_fit, mon
     one = dataclasses.replace(b0005_fit, discharges=b0005_fit.discharges[1:2])
     assert one.life_q_mobile_C[0] == pytest.approx(0.7 * q_C[1] / 1.2)
     settings = Settings(cell=b0005_fit)
-    for other in load_nasa_discharges("B0006")[40:160:40]:
+    for other in load_nasa_discharges("B0006")[40:160:60]:
         start_s, end_s = other.load_on_time_s, other.eod_time_s(2.7)
         seen = other.until(start_s + 0.25 * (end_s - start_s))
         low_s, _, high_s = forecast_end(seen, settings).eod_quantile_s()

@@ -49,7 +49,7 @@ def test_rows_that_are_lost_together_with_their_time_are_seen(method, cell, cycl
     assert "rows are missing" not in sound.reason
 
 
-@pytest.mark.parametrize(("known", "other"), [("B0005", "B0006"), ("B0006", "B0005")])
+@pytest.mark.parametrize(("known", "other"), sweep(("B0005", "B0006"), ("B0006", "B0005")))
 def test_a_cell_of_a_known_kind_is_settled_before_its_end(known, other):
     fit = fit_cell([load_nasa_discharges(known)[n] for n in (2, 80, 150)], cut_off_V=2.7)
     settings, settled = Settings(cell=fit), 0

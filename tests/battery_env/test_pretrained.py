@@ -1,7 +1,6 @@
 """The policies that come with the package."""
 
 import hashlib
-import subprocess
 import sys
 from importlib.resources import files
 
@@ -70,7 +69,7 @@ def test_it_does_what_its_card_says():
 
 @pytest.mark.parametrize("cell", BUNDLED_CELLS)
 def test_on_recorded_cells_the_one_for_them_agrees_with_least_squares_and_settles(cell):
-    records = [discharge.loaded_part(2.7) for discharge in load_nasa_discharges(cell)[::12]]
+    records = [discharge.loaded_part(2.7) for discharge in load_nasa_discharges(cell)[::24]]
     truth = [LeastSquares(thermal=True, mismatch_V=0.05).estimate(record).q_mobile for record in records]
     estimates = [last_estimate(trace) for trace in PolicyEstimator.pretrained(recorded=True).trace(records)]
     off = np.abs(np.array([estimate.q_mobile for estimate in estimates]) / truth - 1.0)
@@ -104,16 +103,6 @@ class TestWhatIsNotThere:
         for cell in TrajectoryDataset.along(options["path"], 4, [pulses], seed=7):
             found = calibrate(Discharge(cell.time_s, cell.voltage_V, cell.current_A, starts_at_rest=True), method="policy")
             assert abs(found.r_o_ohm / cell.r_o - 1.0) < 0.1 or not found.settled_r_o
-
-
-def test_it_needs_no_torch():
-    code = (
-        "import sys; sys.modules['torch'] = None; sys.modules['stable_baselines3'] = None\n"
-        "from battery_env import PolicyEstimator, load_nasa_discharges\n"
-        "print(PolicyEstimator.pretrained().estimate(load_nasa_discharges('B0005')[0].loaded_part(2.7)).q_mobile)\n"
-    )
-    q_mobile = float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
-    assert 6000.0 < q_mobile < 8000.0
 
 
 @pytest.mark.parametrize("env_id", ["BatteryVoltageRo-v0", "BatteryRo-v0", "../secrets"])

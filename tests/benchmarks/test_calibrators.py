@@ -121,6 +121,7 @@ class TestProgpyFilters:
         assert again.r_o == first.r_o[-1] == pytest.approx(0.2, rel=0.03)
         np.testing.assert_array_equal(first.q_mobile, NEW_CELL.q_mobile)
 
+    @pytest.mark.attacks
     def test_progpy_leaves_the_style_of_figures_as_it_is(self, filters):
         check = "from matplotlib import rcParams, rcParamsDefault as d; assert rcParams['font.size'] == d['font.size']"
         subprocess.run([sys.executable, "-c", f"import benchmarks.progpy_filters; {check}"], check=True)

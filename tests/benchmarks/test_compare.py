@@ -172,11 +172,11 @@ def test_defaults_are_the_line_as_typed(algo, tmp_path, monkeypatch):
     monkeypatch.setattr(
         contests, "evaluate", lambda estimator, data: captured.append(estimator.policy) or evaluate(estimator, data)
     )
-    chosen = recipe(algo, timesteps=150, evaluations=1, defaults=True)
+    chosen = recipe(algo, timesteps=110, evaluations=1, defaults=True)
     assert chosen.name.startswith(f"{algo}_defaults_seed0_")
     compare.part(asdict(chosen), tmp_path)
-    typed = ALGOS[algo]("MlpPolicy", ENV_ID, seed=0, device="cpu").learn(150)
-    assert typed._n_updates == captured[-1]._n_updates == 50
+    typed = ALGOS[algo]("MlpPolicy", ENV_ID, seed=0, device="cpu").learn(110)
+    assert typed._n_updates == captured[-1]._n_updates == 10
     for ours, expected in zip(captured[-1].policy.parameters(), typed.policy.parameters(), strict=True):
         assert th.equal(ours, expected)
 

@@ -20,6 +20,7 @@ from sb3_lac import LAC
 from sb3_lac.envs import LinearCostEnv
 from sb3_lac.stability import fitting
 from tests.policies import Always
+from tests.sweeps import sweep
 
 IDS = list(control.DISTURBANCES)
 
@@ -75,7 +76,7 @@ def test_shares_are_of_the_way_that_is_left_and_the_dead_have_not_arrived():
     assert list(control.shares_of(pd.DataFrame(outcome), 0.1).values()) == [0.75, 0.5, 0.25]
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", sweep(*IDS))
 def test_only_some_loops_end_at_the_goal(env_id):
     tolerance = gym.make(env_id).unwrapped.error_tolerance
     at_goal = {

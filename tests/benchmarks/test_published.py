@@ -13,6 +13,7 @@ from benchmarks import control, published, stabilisation
 from benchmarks.training import set_up
 from benchmarks.two_rate_sac import TwoRateSAC
 from sb3_lac.envs import reference_controller
+from tests.sweeps import sweep
 
 
 @pytest.mark.attacks
@@ -39,7 +40,7 @@ def test_trained_policies_are_judged(tmp_path, monkeypatch, train_nothing, capsy
     assert all((tmp_path / name).stat().st_size > 1000 for name in ("learning.png", "impulses.png", "changes.png"))
 
 
-@pytest.mark.parametrize("policy", ["lac", "sac"])
+@pytest.mark.parametrize("policy", sweep("lac", "sac"))
 def test_settings_are_those_of_the_paper_and_rates_fall_apart(policy, tmp_path):
     recipe = published.contender(policy, "Oscillator-v0").recipe("Oscillator-v0", 0, 1100)
     _, model = set_up(recipe, tmp_path)

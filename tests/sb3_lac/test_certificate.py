@@ -233,18 +233,13 @@ def test_cost_that_goes_up_and_down_does_not_rise():
     assert report.metrics["late_rise"].value < 0
 
 
-@pytest.mark.parametrize("n", [1, 2, 60])
-@pytest.mark.parametrize("confidence", [0.8, 0.95])
-def test_exact_bounds_cover(n, confidence):
-    counts = np.arange(n + 1)
-    lower = np.array([exact_lower_bound(int(k), n, confidence) for k in counts])
-    intervals = np.array([exact_interval(int(k), n) for k in counts])
-    for probability in (0.01, 0.3, 0.5, 0.9, 0.99, 0.999):
-        weights = binom.pmf(counts, n, probability)
-        assert weights[lower <= probability].sum() >= confidence - 1e-9
-        assert weights[(intervals[:, 1] <= probability) & (probability <= intervals[:, 2])].sum() >= 0.95 - 1e-9
-    # Of all trials: (1 - confidence)^(1/n), which is at least 99 % for 300 of 300 with 95 %
-    assert lower[-1] == pytest.approx((1 - confidence) ** (1 / n))
+def test_at_exact_bounds_what_was_seen_is_as_unlikely_as_they_say():
+    for n_true, n in ((1, 1), (1, 2), (7, 60), (59, 60), (60, 60)):
+        share, low, high = exact_interval(n_true, n)
+        assert share == n_true / n and binom.sf(n_true - 1, n, low) == pytest.approx(0.025)
+        assert high == 1.0 if n_true == n else binom.cdf(n_true, n, high) == pytest.approx(0.025)
+        assert binom.sf(n_true - 1, n, exact_lower_bound(n_true, n, 0.8)) == pytest.approx(0.2)
+    assert exact_interval(0, 9).low == exact_lower_bound(0, 9, 0.8) == 0.0
 
 
 def test_returns_look_as_far_as_the_trace(monkeypatch):

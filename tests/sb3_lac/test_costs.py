@@ -40,7 +40,7 @@ def warnings_of(model, n_steps=60):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model.learn(n_steps)
-        model.learn(20, reset_num_timesteps=False)
+        model.learn(6, reset_num_timesteps=False)
     assert model._n_updates > 0
     return [str(warning.message) for warning in caught if "termination" in str(warning.message)]
 

@@ -10,6 +10,7 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_lac import LAC, PublishedLAC
+from tests.sweeps import sweep
 
 
 def assert_same(value, other):
@@ -39,12 +40,14 @@ def test_a_copy_goes_on_like_the_model_itself(make_model, train_metrics, algorit
         (1, None, {}),
         (2, None, {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2)), "gradient_steps": -1}),
         (1, False, {"use_sde": True, "n_steps": 3}),
-        (2, True, {"lambda_learning_rate": 0.01, "alpha3": 0.2, "lambda_init": 0.5}),
-        (1, None, {"ent_coef": 0.1, "policy_kwargs": {"n_critics": 2, "share_features_extractor": True}}),
-        (1, None, {"algorithm": PublishedLAC, "critic_learning_rate": 1e-3}),
-        (1, None, {"algorithm": PublishedLAC, "horizon": 3}),
+        *sweep(
+            (1, None, {"algorithm": PublishedLAC, "critic_learning_rate": 1e-3}),
+            (1, None, {"algorithm": PublishedLAC, "horizon": 3}),
+            (2, True, {"lambda_learning_rate": 0.01, "alpha3": 0.2, "lambda_init": 0.5}),
+            (1, None, {"ent_coef": 0.1, "policy_kwargs": {"n_critics": 2, "share_features_extractor": True}}),
+        ),
     ],
-    ids=["default", "noise", "normalized_and_gsde", "normalized_rewards", "fixed_entropy_and_twins", "published", "horizon"],
+    ids=["default", "noise", "normalized_and_gsde", "published", "horizon", "normalized_rewards", "fixed_entropy_and_twins"],
 )
 def test_interrupted_run_ends_like_an_uninterrupted_one(
     make_model, make_env, n_updates, tmp_path, n_envs, norm_reward, kwargs

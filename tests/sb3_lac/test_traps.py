@@ -49,8 +49,8 @@ def sure_or_by_chance(actions, rng):
 @pytest.mark.parametrize(
     ("costs_of_actions", "low", "high"),
     sweep(
-        # The states that steps lead to are terminal: an actor that learns there only would learn nothing. Five seeds reached
-        # 0.43 to 0.56, and began within 0.1 of 0
+        # The states that steps lead to are terminal: an actor that learns there only would learn nothing. Three seeds reached
+        # 0.51 to 0.68, and began between -0.21 and -0.03
         (near_a_half, 0.25, 0.75),
         # The price of a root, which docs/how_lac_works.md states: 1 % of 300 seems less than a sure 1
         (sure_or_by_chance, -1.0, -0.3),
@@ -59,7 +59,7 @@ def sure_or_by_chance(actions, rng):
 def test_episodes_of_one_step_are_learned_and_a_chance_of_a_dear_event_is_underrated(
     make_model_without_env, costs_of_actions, low, high
 ):
-    model = make_model_without_env(learning_rate=3e-3, ent_coef=0.01)
+    model = make_model_without_env(learning_rate=5e-3, ent_coef=0.01)
     rng = np.random.default_rng(0)
 
     def sample(batch_size, env=None):
@@ -68,7 +68,7 @@ def test_episodes_of_one_step_are_learned_and_a_chance_of_a_dear_event_is_underr
         return ReplayBufferSamples(obs, actions, th.zeros_like(obs), th.ones_like(costs), -costs)
 
     model.replay_buffer.sample = sample
-    model.train(gradient_steps=500, batch_size=64)
+    model.train(gradient_steps=300, batch_size=64)
     actions, _ = model.predict(np.zeros(2, dtype=np.float32), deterministic=True)
     assert low < actions[0] < high
 
