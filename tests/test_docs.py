@@ -89,8 +89,7 @@ def run_briefly(source, name, folder, monkeypatch):
     exec(compile(source, name, "exec"), {"__name__": "__main__"})
 
 
-#: What takes as long as a training
-LONG = {"cell_life.md", "compare_calibrators.md", "lac_single_file.py"}
+LONG = {"cell_life.md", "compare_calibrators.md", "fit_own_cell.py", "forecasts.md", "lac_single_file.py", "own_cell.md"}
 
 
 def tried(files):

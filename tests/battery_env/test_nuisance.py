@@ -102,6 +102,7 @@ class TestTask:
             together, alone = many.step(np.full((3, 2), 0.05))[0], one.step(np.full((1, 2), 0.05))[0]
 
 
+@pytest.mark.attacks
 def test_the_step_alone_is_a_good_calibrator_of_cells_that_are_not_the_model():
     data = TrajectoryDataset.generate(("q_mobile", "r_o"), 8, RandomPiecewise(), seed=1, r_o_range=(0.1, 0.3), mismatch=0.2)
     estimator = PolicyEstimator(Step(), "BatteryVoltageJoint-v0", nuisance=0.2, reading_s=2.0)

@@ -52,6 +52,7 @@ def test_the_card_is_that_of_the_file(recorded, aged_both):
     assert policy.observation_shape == env.observation_space.shape
 
 
+@pytest.mark.attacks
 def test_it_does_what_its_card_says():
     """On a tenth of the discharges, with 5 mV of noise and constants that are off by 20 %."""
     estimator = PolicyEstimator.pretrained()
@@ -67,7 +68,7 @@ def test_it_does_what_its_card_says():
         assert scores[f"{name}_second_half_mape_percent"].mean() < 2.0 * row["mean_percent"]
 
 
-@pytest.mark.parametrize("cell", BUNDLED_CELLS)
+@pytest.mark.parametrize("cell", sweep(*BUNDLED_CELLS))
 def test_on_recorded_cells_the_one_for_them_agrees_with_least_squares_and_settles(cell):
     records = [discharge.loaded_part(2.7) for discharge in load_nasa_discharges(cell)[::24]]
     truth = [LeastSquares(thermal=True, mismatch_V=0.05).estimate(record).q_mobile for record in records]

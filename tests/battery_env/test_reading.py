@@ -343,7 +343,7 @@ def test_what_is_left_aside_is_named_and_a_mistake_in_some_cycles_loses_no_other
     assert found.charge_C == pytest.approx(10.0 * RECORD.charge_C, rel=3e-3)
 
 
-@pytest.mark.parametrize("share", [400.0, 22.0, 1e-1, 1e-2, 3e-3, 1e-4])
+@pytest.mark.parametrize("share", [22.0, *sweep(1e-2, 400.0, 1e-1, 3e-3, 1e-4)])
 def test_the_charge_of_a_cell_of_any_size_is_known_and_where_that_is_another_its_constants_are_not(share):
     (found,) = calibrate(TABLE.assign(current=share * TABLE["current"]).rename(columns={"current": "current (A)"}))
     assert found.drawn_Ah == pytest.approx(share * RECORD.loaded_part(2.7).charge_C / 3600.0, rel=0.01)

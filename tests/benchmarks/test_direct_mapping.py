@@ -87,6 +87,7 @@ class TestDirectMapping:
             assert middle.q_mobile == pytest.approx(trace.q_mobile[[100]], rel=1e-5)
         assert mapping.estimate(records[0]).q_mobile == pytest.approx(traces[0].q_mobile[-1], rel=1e-5)
 
+    @pytest.mark.attacks
     def test_it_learns_and_equal_seeds_make_equal_mappings(self, few):
         data = few["q_mobile"]
         pairs, others = (draw_pairs(data, "q_mobile", 2000, seed) for seed in (0, 1))

@@ -103,11 +103,8 @@ NEEDS_GPU = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
         *sweep(
             pytest.param("inductor", SCHEDULES | SMALLEST, marks=NEEDS_COMPILER),
             ("eager", SCHEDULES),
-            (
-                "eager",
-                {"algorithm": PublishedLAC, "reward_bound": 3.0, "critic_learning_rate": LinearSchedule(1e-2, 1e-3, 1.0)},
-            ),
-            ("eager", {"algorithm": PublishedLAC, "horizon": 4, "ent_coef": 0.2}),
+            ("eager", {"algorithm": PublishedLAC, "critic_learning_rate": LinearSchedule(1e-2, 1e-3, 1.0)}),
+            ("eager", {"algorithm": PublishedLAC, "horizon": 4, "ent_coef": 0.2, "reward_bound": 3.0}),
             ("eager", {"ent_coef": 0.2, "reward_bound": 3.0, "n_steps": 3}),
             ("eager", {"policy_kwargs": {"n_critics": 2, "root": 4, "net_arch": [16, 16], "share_features_extractor": True}}),
             ("eager", {"policy": "MultiInputPolicy", "wrapper": seen}),

@@ -280,6 +280,7 @@ class TestEnvironments:
         assert not steps_as_one_batch(gym.spec("CartPole-v1"))  # it would go without its own choice of new episodes
 
 
+@pytest.mark.attacks
 def test_a_model_goes_to_the_hub_and_comes_back(workdir, monkeypatch):
     class Hub:
         """What is uploaded lies in a folder."""
