@@ -53,6 +53,7 @@ from battery_env.policies.pretrained import file_stem, write_card
 from battery_env.records import drawn
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
 from battery_env.records.model import RecordModel
+from benchmarks.runs import setting_of_lac
 from benchmarks.study import (
     Cell,
     Study,
@@ -89,7 +90,6 @@ TRAINED_WITH: dict[str, Any] = {
 }
 #: How many cells policies learn on, and with how many updates: few, as they begin with what the fit says.
 TRAINING_CELLS, UPDATES = 700, 2500
-NETWORKS = "dict(net_arch=[64, 64], activation_fn=nn.LeakyReLU)"
 # What the filter takes for the error of a model with the mean constants of a path, V: chosen on B0005.
 _MEAN_CELL_MISMATCH_V = 0.02
 # A regression knows so many steps of the voltage, and how much it is held back: chosen on B0005. It knows steps and not
@@ -138,7 +138,8 @@ def recipe_of(algo: str, cells: Sequence[str], seed: int, folder: Path) -> Recip
         with suppress(FileExistsError):
             TrajectoryDataset.along(path, TRAINING_CELLS, Loads(), seed=0).save(data)
     options = {**OPTIONS, **TRAINED_WITH, "path": str(file), "dataset": str(data)}
-    own = {"env_kwargs": options, "policy_kwargs": NETWORKS}
+    networks = setting_of_lac(4 if algo == "lac" else None)["policy_kwargs"]
+    own = {"env_kwargs": options, "policy_kwargs": networks}
     return Recipe.of(algo, ENV_ID, seed, updates=UPDATES, hyperparameters=own)
 
 

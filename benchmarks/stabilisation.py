@@ -135,17 +135,24 @@ _NOISE = {"noise_type": "normal", "noise_std": 0.1}
 #: Who is judged, by the name on the command line.
 CONTENDERS = {
     "lac": Contender("lac", "LAC", COLOUR_OF["LAC"], "o", compiles=True),
-    "lac_square_root": Contender("lac", "LAC (root=2)", COLOUR_OF["LAC"], "d", None, _SQUARE_ROOT, compiles=True),
+    "lac_square_root": Contender("lac", "LAC (root=2)", COLOUR_OF["LAC"], "d", hyperparameters=_SQUARE_ROOT, compiles=True),
     "published_lac": Contender("published_lac", "LAC as published", COLOUR_OF["LAC as published"], "P", compiles=True),
     "published_lac_paper": Contender(
-        "published_lac", "LAC as published, its setting", COLOUR_OF["LAC as published"], "X", "published_lac", compiles=True
+        "published_lac",
+        "LAC as published, its setting",
+        COLOUR_OF["LAC as published"],
+        "X",
+        settings="published_lac",
+        compiles=True,
     ),
     "sac": Contender("sac", "SAC", COLOUR_OF["SAC"], "s"),
-    "sac_common": Contender("sac", "SAC, LAC's setting", COLOUR_OF["SAC"], "8", "lac", _NETWORKS),
+    "sac_common": Contender("sac", "SAC, LAC's setting", COLOUR_OF["SAC"], "8", settings="lac", hyperparameters=_NETWORKS),
     "td3": Contender("td3", "TD3", COLOUR_OF["TD3"], "^"),
-    "td3_common": Contender("td3", "TD3, LAC's setting", COLOUR_OF["TD3"], ">", "lac", {**_NETWORKS, **_NOISE}),
+    "td3_common": Contender(
+        "td3", "TD3, LAC's setting", COLOUR_OF["TD3"], ">", settings="lac", hyperparameters={**_NETWORKS, **_NOISE}
+    ),
     "tqc": Contender("tqc", "TQC", COLOUR_OF["TQC"], "D"),
-    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "*", "lac", _NETWORKS),
+    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "*", settings="lac", hyperparameters=_NETWORKS),
     "metric_sac": Contender(_METRIC_SAC, "SAC, LAC's metric", COLOURS[4], "v", compiles=True),
 }
 #: How they are drawn: colour and marker.
