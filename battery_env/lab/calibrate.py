@@ -216,23 +216,24 @@ def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
     )
 
 
-def _goes_on(part: _LoadedPart, load: LoadToCome | None) -> bool:
-    """Whether a record is in progress at a constant load, as far as is known for ever."""
-    is_over = float(part.discharge.time_s[-1] - part.loaded.time_s[-1]) > STEADY_S
-    return part.in_progress and load is None and not part.load.varied and not is_over
+def _is_running(part: _LoadedPart) -> bool:
+    """Whether a record is in progress, its load not switched off for good."""
+    return part.in_progress and float(part.discharge.time_s[-1] - part.loaded.time_s[-1]) <= STEADY_S
 
 
 def _estimate(
     part: _LoadedPart, settings: Settings, load: LoadToCome | None
 ) -> tuple[Estimate, Method, RecordModel, ModelNow | None]:
     """The estimate, the method, the model that it is of, and of the filter where this stands at the end of the record."""
-    goes_on, is_new = _goes_on(part, load), settings.prior_q_mobile_C is None and settings.cell is None
-    # under other loads the filter, which takes the error of the model for noise, is surer than it may be
-    method = settings.method or ("kalman" if goes_on and is_new else "least-squares")
+    is_running, is_new = _is_running(part), settings.prior_q_mobile_C is None and settings.cell is None
+    # before the knee least squares, of which all parameters are free then, take any large q_mobile for likely
+    method = settings.method or ("kalman" if is_running and is_new else "least-squares")
     calibrator = replace(settings, method=method).calibrator(part.cell, part.start)
     cell, thermal, now = part.cell, settings.thermal, None
     if isinstance(calibrator, ExtendedKalmanFilter):
-        estimate, now = last_estimate(calibrator.follow(part.fitted)), calibrator.now() if goes_on else None
+        estimate = last_estimate(calibrator.follow(part.fitted))
+        # under other loads the filter, which takes the error of the model for noise, is surer than it may be
+        now = calibrator.now() if is_running and load is None and not part.load.varied else None
     else:
         estimate = calibrator.estimate(part.fitted)
     if isinstance(calibrator, PolicyEstimator):

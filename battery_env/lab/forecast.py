@@ -359,7 +359,7 @@ def _draw_parameters(
     slope_ohm = float(np.clip(slope_ohm, -sd_ohm, sd_ohm))
     own_ohm = float(np.sqrt(sd_ohm**2 - slope_ohm**2))
     # what r_o has absorbed of the error of the model comes out under another current
-    of_model_ohm = min(sd_ohm, mismatch_V / float(np.sqrt(np.mean(current_A**2)))) if current_A.any() else 0.0
+    of_model_ohm = mismatch_V / float(np.sqrt(np.mean(current_A**2))) if current_A.any() else 0.0
     whole_ohm = float(np.hypot(own_ohm, np.sqrt(WHOLE_ERROR**2 - 1.0) * of_model_ohm))
     draws, middle_ohm = rng.standard_normal(samples), r_ohm + slope_ohm * deviation
     r_o, acting_ohm = (np.clip(middle_ohm + each_ohm * draws, *R_O.limits) for each_ohm in (own_ohm, whole_ohm))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import exp, hypot, isnan, log, sqrt
+from dataclasses import dataclass, replace
+from math import exp, hypot, isnan, log, nan, sqrt
 from numbers import Real
 from typing import Any
 
@@ -52,6 +52,8 @@ class Life:
     :param drift_share: mean step
     :param state: mean of (ln ``q_mobile`` after the last discharge, drift), shape (2,)
     :param covariance: theirs, shape (2, 2)
+    :param sd_share: standard deviation of ``q_mobile`` of the last valid discharge as a share of it, the constants as unsure as
+        they are at a load that is not that of the life; NaN: not known
     """
 
     table: pd.DataFrame
@@ -60,6 +62,7 @@ class Life:
     drift_share: float
     state: FloatArray
     covariance: FloatArray
+    sd_share: float = nan
 
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
@@ -83,8 +86,7 @@ class Life:
     def prior_at_other_loads_C(self) -> tuple[float, float]:
         """The same for a load that is not that of the life: the error that all estimates share counts too, in full."""
         mean_C, sd_C = self.next_q_mobile_C
-        last = self.table[self.table["valid"]].iloc[-1]
-        return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * last["sd_q_mobile_C"] / last["q_mobile_C"])
+        return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * self.sd_share)
 
     def prior_for(self, running: Discharge, load: LoadToCome | None = None) -> tuple[float, float]:
         """
@@ -117,7 +119,7 @@ class Life:
         """
         if not 1 <= check_whole_number("count", count) <= len(self.table):
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
-        return life_of(self.table.iloc[:count])
+        return replace(life_of(self.table.iloc[:count]), sd_share=self.sd_share)
 
     def remaining_discharges(self, threshold_Ah: float, probability: ArrayLike = BAND) -> FloatArray:
         """
@@ -148,7 +150,12 @@ class Life:
         return quantile(left, probability)
 
 
-def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: LeastSquares | None = None) -> Life:
+def track_life(
+    discharges: Sequence[Discharge],
+    cut_off_V: float,
+    calibrator: LeastSquares | None = None,
+    at_other_loads: LeastSquares | None = None,
+) -> Life:
     """
     Follow ``q_mobile`` of one cell from discharge to discharge.
 
@@ -170,10 +177,15 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     :param discharges: of one cell, in their order
     :param cut_off_V: where they end, V
     :param calibrator: without a prior; ``None``: least squares with the constants of a new 18650 as they are
+    :param at_other_loads: the same with constants as unsure as they are, which tells how sure ``q_mobile`` is at other loads;
+        ``None``: those of any cell, or the calibrator that is given
     :raises ValueError: if no discharge is valid, or the calibrator has a prior or no full cell at the start
     """
-    chosen = calibrator or Settings(method="least-squares", cell_rates_sd={}).calibrator()
+    known = Settings(method="least-squares")
+    chosen = calibrator or replace(known, cell_rates_sd={}).calibrator()
+    unsure = at_other_loads or calibrator or known.calibrator()
     assert isinstance(chosen, LeastSquares)
+    assert isinstance(unsure, LeastSquares)
     if chosen.prior_q_mobile_C is not None:
         raise ValueError("the calibrator must have no prior of q_mobile: each discharge has to speak for itself")
     if chosen.initial_soc != (1.0, 0.0):
@@ -187,7 +199,10 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
             rows.append(row | _row_of(discharge, cut_off_V, chosen))
         except ValueError as error:  # of one that cannot be used
             rows.append(row | {"settled": False, "valid": False, "reason": str(error)})
-    return life_of(pd.DataFrame(rows, columns=_COLUMNS))
+    life = life_of(pd.DataFrame(rows, columns=_COLUMNS))
+    last = discharges[int(np.flatnonzero(life.table["valid"])[-1])]
+    estimate = unsure.estimate(last.loaded_part(cut_off_V))
+    return replace(life, sd_share=estimate.sd_q_mobile / estimate.q_mobile)
 
 
 def _row_of(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> dict[str, Any]:

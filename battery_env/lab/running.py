@@ -214,10 +214,12 @@ def _with_prior(settings: Settings, prior_q_mobile_C: tuple[float, float]) -> Se
 
 def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
     """The life of a cell, by whole discharges that are looked at as the next one is."""
+    known = replace(settings, method="least-squares", initial_soc=1.0)
     # all of them have the same constants, whatever these are
-    calibrator = replace(settings, method="least-squares", initial_soc=1.0, cell_rates_sd={}).calibrator()
+    calibrator, at_other_loads = replace(known, cell_rates_sd={}).calibrator(), known.calibrator()
     assert isinstance(calibrator, LeastSquares)
-    return track_life(discharges, settings.cut_off_V, calibrator)
+    assert isinstance(at_other_loads, LeastSquares)
+    return track_life(discharges, settings.cut_off_V, calibrator, at_other_loads)
 
 
 def end_of_record(

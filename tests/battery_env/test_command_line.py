@@ -149,14 +149,14 @@ def test_the_record_chooses_the_method_and_not_what_comes_out(recorded):
     rest = [running.time_s[-1] + 60.0 * np.arange(1.0, 5.0), np.linspace(3.7, 3.8, 4), np.zeros(4)]
     columns = (running.time_s, running.voltage_V, running.current_A)
     paused = Discharge(*map(np.append, columns, rest))
-    pulses = simulate(np.where(np.arange(1600) % 200 < 100, 4.0, 0.0), 7000.0, 0.12, load_unit="current", thermal=True)
+    pulses = simulate(np.where(np.arange(1600) % 200 < 100, 4.0, 1.0), 7000.0, 0.12, load_unit="current", thermal=True)
     for record, options, method in (
         (running, {}, "kalman"),
         (running, {"nominal_Ah": 2.0}, "kalman"),
         (running, {"prior_q_mobile_C": (5460.0, 55.0)}, "least-squares"),
         (running, {"cell": NEW_CELL}, "least-squares"),
         (paused, {}, "least-squares"),
-        (seen(pulses, slice(None)), {}, "least-squares"),
+        (seen(pulses, slice(None)), {}, "kalman"),
         (whole, {}, "least-squares"),
         (whole, {"method": "kalman"}, "kalman"),
     ):
