@@ -9,7 +9,8 @@ Forecast the end of discharges in progress beside what needs no model, and the e
 with the constants that :func:`battery_env.fit_cell` finds of B0005 (seed 0) and of B0006 (seed 1), four of them off by another
 20 %, which the model does not know: it has those of a new 18650. Eight discharges at 2 A are their life; the ninth has a load
 that changes. Voltages have 5 mV of noise, and the current sensor a gain of 0.5 %. The load to come is known, but for two rows;
-of these the one without a life is what the command says of a file alone.
+of these the one without a life is what the command says of a file alone. Beside them constants are fitted to the last three
+discharges of the life.
 *Life*: what was expected of each discharge, and of the life that remains. Constants of the method were chosen with B0005 and
 seed 0; B0006 and seed 1 were not looked at for it.
 """
@@ -47,10 +48,10 @@ END_OF_LIFE_Ah = 1.4
 MISMATCH, NOISE_V, GAIN_SD, BEFORE, STEP = 0.2, 0.005, 0.005, 8, (-0.002, 0.007)
 #: The cell that simulated ones resemble, by seed.
 SEEDS = {0: "B0005", 1: "B0006"}
-#: Discharges of it that are fitted.
-FITTED = (0, 83, 167)
+#: Discharges of it that are fitted, and how many of the last of a life.
+FITTED, FITTED_LAST = (0, 83, 167), 3
 
-FORECAST, UNKNOWN_LOAD = "forecast, life known", "the same, load unknown"
+FORECAST, UNKNOWN_LOAD, OWN_FIT = "forecast, life known", "the same, load unknown", "forecast, life known and fitted"
 NO_LIFE, NOTHING = "forecast, nothing but the load known", "forecast, nothing known"
 _LONGEST_S = 20_000.0
 
@@ -119,9 +120,14 @@ BASELINES: dict[str, Callable[[Record, Record, Load], float]] = {
 
 
 def ends(
-    last: Record, running: Discharge, prior_C: tuple[float, float], load_after: Callable[[float], Load], end_s: float
+    last: Record,
+    running: Discharge,
+    prior_C: tuple[float, float],
+    load_after: Callable[[float], Load],
+    end_s: float,
+    fitted: Settings | None = None,
 ) -> Iterator[dict[str, object]]:
-    """What every method says of a discharge, at each share of it."""
+    """What every method says of a discharge, at each share of it; with what was fitted to its life, if that was."""
     start_s = running.load_on_time_s
     percent = 100.0 / (end_s - start_s)
     for share in SHARES:
@@ -133,6 +139,8 @@ def ends(
         carried = Settings(cut_off_V=CUT_OFF_V, prior_q_mobile_C=prior_C)
         new = Settings(cut_off_V=CUT_OFF_V)
         cases = {FORECAST: (carried, load), UNKNOWN_LOAD: (carried, None), NO_LIFE: (new, load), NOTHING: (new, None)}
+        if fitted is not None:
+            cases[OWN_FIT] = (fitted, load)
         for name, (settings, known) in cases.items():
             low_s, median_s, high_s = forecast_end(seen, settings, known, SAMPLES).eod_quantile_s(BAND)
             yield {
@@ -180,14 +188,16 @@ def simulated_rows(kind: str, seed: int, fit: CellFit, count: int) -> list[dict[
             noise_V, true_end_s = NOISE_V * rng.standard_normal(len(whole.time_s)), whole.reached_s(CUT_OFF_V)
             records.append(Discharge(whole.time_s, whole.voltage_V + noise_V, gain * whole.current_A, starts_at_rest=True))
         *before, running = records
-        life = track_life(before, CUT_OFF_V)
+        life, own = track_life(before, CUT_OFF_V), fit_cell(before[-FITTED_LAST:], CUT_OFF_V)
+        fitted_C = track_life(before, CUT_OFF_V, own.calibrator()).prior_at_other_loads_C
 
         def rest_of(now_s: float, whole: Load = load) -> Load:
             later = whole.start_s > now_s
             values = np.append(whole(np.array([now_s])), whole.value[later])
             return Load(np.append(0.0, whole.start_s[later] - now_s), values, "current")
 
-        said = ends(before[-1].loaded_part(CUT_OFF_V), running, life.prior_at_other_loads_C, rest_of, true_end_s)
+        fitted = Settings(cell=own, prior_q_mobile_C=fitted_C, cell_rates_sd={})
+        said = ends(before[-1].loaded_part(CUT_OFF_V), running, life.prior_at_other_loads_C, rest_of, true_end_s, fitted)
         rows += [{"data": f"like {SEEDS[seed]}, seed {seed}", "load": kind, "discharge": n} | row for row in said]
     return rows
 
