@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from math import exp, hypot, isnan, log, nan, sqrt
 from numbers import Real
@@ -20,6 +21,7 @@ from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import is_only_imprecise
 from battery_env.lab.settings import Settings
@@ -52,8 +54,8 @@ class Life:
     :param drift_share: mean step
     :param state: mean of (ln ``q_mobile`` after the last discharge, drift), shape (2,)
     :param covariance: theirs, shape (2, 2)
-    :param sd_share: standard deviation of ``q_mobile`` of the last valid discharge as a share of it, the constants as unsure as
-        they are at a load that is not that of the life; NaN: not known
+    :param sd_share: standard deviation of ``q_mobile`` of the last valid discharge, as a share of it, with constants as unsure as
+        they are; NaN: not known
     """
 
     table: pd.DataFrame
@@ -150,12 +152,7 @@ class Life:
         return quantile(left, probability)
 
 
-def track_life(
-    discharges: Sequence[Discharge],
-    cut_off_V: float,
-    calibrator: LeastSquares | None = None,
-    at_other_loads: LeastSquares | None = None,
-) -> Life:
+def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: LeastSquares | None = None) -> Life:
     """
     Follow ``q_mobile`` of one cell from discharge to discharge.
 
@@ -176,19 +173,32 @@ def track_life(
 
     :param discharges: of one cell, in their order
     :param cut_off_V: where they end, V
-    :param calibrator: without a prior; ``None``: least squares with the constants of a new 18650 as they are
-    :param at_other_loads: the same with constants as unsure as they are, which tells how sure ``q_mobile`` is at other loads;
-        ``None``: those of any cell, or the calibrator that is given
+    :param calibrator: without a prior, such as ``Settings(cell=fit).calibrator()``. All discharges have the same constants; how
+        unsure these are counts at other loads. ``None``: least squares with the constants of a new 18650
     :raises ValueError: if no discharge is valid, or the calibrator has a prior or no full cell at the start
     """
-    known = Settings(method="least-squares")
-    chosen = calibrator or replace(known, cell_rates_sd={}).calibrator()
-    unsure = at_other_loads or calibrator or known.calibrator()
-    assert isinstance(chosen, LeastSquares)
+    if calibrator is None:
+        return life_before(discharges, Settings(cut_off_V=cut_off_V))
+    held = copy(calibrator)
+    if held.path is None:
+        held.nuisance = {name: sd for name, sd in held.nuisance.items() if name not in RATE_CONSTANTS}
+    return _track(discharges, cut_off_V, held, calibrator)
+
+
+def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
+    """The life of a cell, by whole discharges that are looked at as the next one is."""
+    known = replace(settings, method="least-squares", initial_soc=1.0)
+    held, unsure = replace(known, cell_rates_sd={}).calibrator(), known.calibrator()
+    assert isinstance(held, LeastSquares)
     assert isinstance(unsure, LeastSquares)
-    if chosen.prior_q_mobile_C is not None:
+    return _track(discharges, settings.cut_off_V, held, unsure)
+
+
+def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares, unsure: LeastSquares) -> Life:
+    """Follow a cell with constants that are held, and tell how sure its last discharge is with constants that are not."""
+    if held.prior_q_mobile_C is not None:
         raise ValueError("the calibrator must have no prior of q_mobile: each discharge has to speak for itself")
-    if chosen.initial_soc != (1.0, 0.0):
+    if held.initial_soc != (1.0, 0.0):
         raise ValueError("the calibrator must take discharges to start full: the charge to the cut-off is no capacity else")
     if not len(discharges):
         raise ValueError("discharges must hold at least one discharge")
@@ -196,7 +206,7 @@ def track_life(
     for position, discharge in enumerate(discharges):
         row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
         try:
-            rows.append(row | _row_of(discharge, cut_off_V, chosen))
+            rows.append(row | _row_of(discharge, cut_off_V, held))
         except ValueError as error:  # of one that cannot be used
             rows.append(row | {"settled": False, "valid": False, "reason": str(error)})
     life = life_of(pd.DataFrame(rows, columns=_COLUMNS))

@@ -14,12 +14,12 @@ from plotly.colors import qualitative
 
 from battery_env.lab.batch import attempt
 from battery_env.lab.calibrate import calibrate
-from battery_env.lab.life import Life
+from battery_env.lab.life import Life, life_before
 from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.discharges import Recording
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.report import Calibration
-from battery_env.lab.running import forecast_end, life_before
+from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import Source, find_sources, no_formula, read_source, record_name
 from battery_env.loads import constant

@@ -12,12 +12,11 @@ import pandas as pd
 
 from battery_env.checks import LoadUnit
 from battery_env.electrochemistry.ends import BAND, quantile
-from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import is_only_imprecise
 from battery_env.files import finite_or_none, replacing
 from battery_env.lab.calibrate import calibrated
 from battery_env.lab.forecast import Forecast, decimals
-from battery_env.lab.life import Life, track_life
+from battery_env.lab.life import Life, life_before
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Settings
@@ -210,16 +209,6 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
 def _with_prior(settings: Settings, prior_q_mobile_C: tuple[float, float]) -> Settings:
     """What a life tells of ``q_mobile``, with the constants by which it was tracked."""
     return replace(settings, prior_q_mobile_C=prior_q_mobile_C, cell_rates_sd={})
-
-
-def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
-    """The life of a cell, by whole discharges that are looked at as the next one is."""
-    known = replace(settings, method="least-squares", initial_soc=1.0)
-    # all of them have the same constants, whatever these are
-    calibrator, at_other_loads = replace(known, cell_rates_sd={}).calibrator(), known.calibrator()
-    assert isinstance(calibrator, LeastSquares)
-    assert isinstance(at_other_loads, LeastSquares)
-    return track_life(discharges, settings.cut_off_V, calibrator, at_other_loads)
 
 
 def end_of_record(
