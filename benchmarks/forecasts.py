@@ -81,33 +81,21 @@ def coulomb_count(last: Record, seen: Record, load: Load) -> float:
     return float(seen.time_s[-1] + np.interp(max(float(left_C), 0.0), load.drawn(since_s), since_s))
 
 
-def last_curve(last: Record, seen: Record, load: Load, stretches: Sequence[float] = (1.0,)) -> float:
-    """It ends as the voltage over charge of the last one does, with the resistance, and the stretch, that fit best."""
+def last_curve(last: Record, seen: Record, load: Load) -> float:
+    """It ends as the voltage over charge of the last one does, with the resistance that fits best."""
     charge_C, seen_C = (drawn(each.time_s, each.current_A, each.time_s) for each in (last, seen))
     usual_A = charge_C[-1] / (last.time_s[-1] - last.time_s[0])
     # beyond its end the curve falls on
     end_C, end_V = charge_C[-1], last.voltage_V[-1]
     slope_V = 0.5 * end_C * (end_V - last.voltage_V[-5]) / (end_C - charge_C[-5])
     curve_C, curve_V = np.append(charge_C, 1.5 * end_C), np.append(last.voltage_V, end_V + slope_V)
-    more_A = (seen.current_A - usual_A)[1:]
-    best, found = np.inf, (1.0, 0.0)
-    for stretch in stretches:
-        lower_V = np.interp(seen_C[1:] / stretch, curve_C, curve_V) - seen.voltage_V[1:]
-        # at the load of the last one a resistance says nothing
-        resistance_ohm = max(float(lower_V @ more_A) / float(more_A @ more_A + 4e-4 * len(more_A)), 0.0)
-        square_V2 = float(((lower_V - resistance_ohm * more_A) ** 2).sum())
-        if square_V2 < best:
-            best, found = square_V2, (stretch, resistance_ohm)
-    stretch, resistance_ohm = found
+    more_A, lower_V = (seen.current_A - usual_A)[1:], np.interp(seen_C[1:], curve_C, curve_V) - seen.voltage_V[1:]
+    # at the load of the last one a resistance says nothing
+    resistance_ohm = max(float(lower_V @ more_A) / float(more_A @ more_A + 4e-4 * len(more_A)), 0.0)
     since_s = np.arange(_LONGEST_S)
-    expected_V = np.interp((seen_C[-1] + load.drawn(since_s)) / stretch, curve_C, curve_V)
+    expected_V = np.interp(seen_C[-1] + load.drawn(since_s), curve_C, curve_V)
     expected_V -= resistance_ohm * (load.on_grid(since_s) - usual_A)
     return float(seen.time_s[-1] + np.argmax(expected_V <= CUT_OFF_V))
-
-
-def stretched_curve(last: Record, seen: Record, load: Load) -> float:
-    """The end by the last curve, stretched by up to 20 %."""
-    return last_curve(last, seen, load, np.linspace(0.8, 1.2, 81).tolist())
 
 
 #: What needs no model.
@@ -115,7 +103,6 @@ BASELINES: dict[str, Callable[[Record, Record, Load], float]] = {
     "as long as the last": as_long_as_the_last,
     "Coulomb count, last capacity": coulomb_count,
     "last curve, R fitted": last_curve,
-    "last curve, stretch and R fitted": stretched_curve,
 }
 
 

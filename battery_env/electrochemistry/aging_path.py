@@ -15,7 +15,7 @@ from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS, CellParameters, check_cell
 from battery_env.electrochemistry.equilibrium import with_equilibrium
-from battery_env.electrochemistry.model_error import more_errors_per_C
+from battery_env.electrochemistry.model_error import MORE_ERRORS
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.files import read_json, write_json
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O
@@ -135,7 +135,7 @@ class AgingPath:
     @property
     def errors_per_C(self) -> float:
         """How many independent errors of the model a coulomb shows, besides a first one."""
-        return more_errors_per_C("path", self.cell.q_mobile)
+        return MORE_ERRORS["path"] / self.cell.q_mobile
 
     @property
     def sd_ratio(self) -> float:

@@ -11,17 +11,11 @@ from battery_env.compiled import compiled
 WHOLE_ERROR = 2.0
 #: So many independent errors the charge of a whole discharge shows beside a first one, by who asks:
 #:
-#: - ``record``: least squares and the filter take the error for one that is common to all of a record
 #: - ``forecast``: the model is wrong in another way at another charge, as fast as the residuals of whole discharges of B0005
 #:   lose their correlation
 #: - ``fit``: what is left of a fit of the constants drifts faster
 #: - ``path``: as does the error of a cell at its place along a path of aging cells. Chosen on B0005 along the path of B0006
-MORE_ERRORS: Mapping[str, float] = {"record": 0.0, "forecast": 1.0 / 0.15, "fit": 49.0, "path": 100.0}
-
-
-def more_errors_per_C(asked_by: str, q_mobile_C: float) -> float:
-    """How many independent errors a coulomb shows beside a first one, of a cell of some ``q_mobile``."""
-    return MORE_ERRORS[asked_by] / q_mobile_C
+MORE_ERRORS: Mapping[str, float] = {"forecast": 1.0 / 0.15, "fit": 49.0, "path": 100.0}
 
 
 @compiled

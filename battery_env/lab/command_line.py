@@ -107,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
         "--method",
         choices=METHODS,
         help="of calibration: least squares, the filter (kalman), or the policy that comes with the package (default: the "
-        "filter in progress at a constant load that goes on, without --prior and --cell; else least squares)",
+        "filter for a record in progress, if neither a prior nor a cell is given, and else least squares)",
     )
     _add_calibration(group)
     group = parser.add_argument_group("results")

@@ -54,8 +54,7 @@ class Life:
     :param drift_share: mean step
     :param state: mean of (ln ``q_mobile`` after the last discharge, drift), shape (2,)
     :param covariance: theirs, shape (2, 2)
-    :param sd_share: standard deviation of ``q_mobile`` of the last valid discharge, as a share of it, with constants as unsure as
-        they are; NaN: not known
+    :param sd_share: standard deviation of the last valid ``q_mobile``, a share, with constants as unsure as they are; or NaN
     """
 
     table: pd.DataFrame
@@ -173,7 +172,7 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
 
     :param discharges: of one cell, in their order
     :param cut_off_V: where they end, V
-    :param calibrator: without a prior, such as ``Settings(cell=fit).calibrator()``. All discharges have the same constants; how
+    :param calibrator: without a prior, as ``Settings(cell=fit).calibrator()`` is. All discharges have the same constants; how
         unsure these are counts at other loads. ``None``: least squares with the constants of a new 18650
     :raises ValueError: if no discharge is valid, or the calibrator has a prior or no full cell at the start
     """
@@ -189,8 +188,7 @@ def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
     """The life of a cell, by whole discharges that are looked at as the next one is."""
     known = replace(settings, method="least-squares", initial_soc=1.0)
     held, unsure = replace(known, cell_rates_sd={}).calibrator(), known.calibrator()
-    assert isinstance(held, LeastSquares)
-    assert isinstance(unsure, LeastSquares)
+    assert isinstance(held, LeastSquares) and isinstance(unsure, LeastSquares)
     return _track(discharges, settings.cut_off_V, held, unsure)
 
 

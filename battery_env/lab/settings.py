@@ -53,9 +53,9 @@ class Settings:
     How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
     ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs.
 
-    :param method: of calibration; ``None``: the filter for a record in progress at a constant load that goes on, of a cell of
-        which neither a prior nor the constants are known, and else least squares. ``"policy"`` is the one that comes with the
-        package, for both parameters; its model is a new 18650 at constant temperature
+    :param method: of calibration; ``None``: the filter for a record in progress under load, if neither a prior nor the cell is
+        known, and else least squares. ``"policy"`` is the one that comes with the package, for both parameters; its model is a
+        new 18650 at constant temperature
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: where that of the fit of ``cell`` does, or 2.7
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
     :param mismatch_V: error to expect of the model itself, V; ``None``: that of the fit of ``cell``, or 0.05

@@ -21,7 +21,6 @@ from battery_env.electrochemistry import (
     rest_shares,
 )
 from battery_env.electrochemistry.kernels import MOLE_FRACTION_MARGIN, cell_voltage
-from battery_env.electrochemistry.model_error import MORE_ERRORS, independent_errors
 from battery_env.electrochemistry.tangents import (
     BY_Q,
     BY_R,
@@ -64,7 +63,6 @@ _LEAST_LOG_WEIGHT = -15.0
 _SAME_SHARE = 0.25
 # The data must have narrowed a prior by this share of its width before a deviation from it says anything.
 _LEAST_NARROWING = 0.2
-_MORE_ERRORS = MORE_ERRORS["record"]
 
 
 def filters_of_prior(
@@ -143,13 +141,6 @@ def _mismatch_V2(evidence: Row, settings: FilterSettings) -> float:
 
 
 @inlined
-def _charge_per_error_C(one: Row) -> float:
-    # For how much charge an error of the model lasts
-    charge_C = one.information.charge_C
-    return charge_C / independent_errors(charge_C, _MORE_ERRORS / one.mean[Q])
-
-
-@inlined
 def _common_error_sd(one: Row, settings: FilterSettings, mismatch_V2: float) -> float:
     # What an error of the model that is common to the discharge leaves open of q_mobile, without its prior, however many
     # samples there are: as much as least squares state. Theirs is the worst error of the stated mean square. Once the knee is
@@ -157,7 +148,7 @@ def _common_error_sd(one: Row, settings: FilterSettings, mismatch_V2: float) -> 
     information, (q_prior, r_prior) = one.information, settings.variance
     if mismatch_V2 == 0.0 or q_prior == 0.0 or information.charge_C == 0.0:
         return 0.0
-    charge_C, own_qq = _charge_per_error_C(one), information.qq
+    charge_C, own_qq = information.charge_C, information.qq
     if r_prior > 0.0:
         own_qq -= information.qr * information.qr / (information.rr + mismatch_V2 * charge_C / r_prior)
     if not own_qq > 0.0:
@@ -170,7 +161,7 @@ def _common_error_sd(one: Row, settings: FilterSettings, mismatch_V2: float) -> 
 def _resistive_error_sd(one: Row, mismatch_V2: float) -> float:
     # And of r_o: an error that goes with the current is no offset, which a load that varies would tell from it.
     information = one.information
-    return sqrt(mismatch_V2 * _charge_per_error_C(one) / information.rr) if information.rr > 0.0 else 0.0
+    return sqrt(mismatch_V2 * information.charge_C / information.rr) if information.rr > 0.0 else 0.0
 
 
 @inlined
