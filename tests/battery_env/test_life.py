@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import Discharge, LeastSquares, load_nasa_discharges, track_life
+from battery_env import Discharge, LeastSquares, Settings, load_nasa_discharges, track_life
 from battery_env.lab.life import life_of
 
 
@@ -102,6 +102,14 @@ class TestRealCell:
         mean_C, sd_C = life.prior_q_mobile_C
         assert (life.table["sd_q_mobile_C"] > 0.03 * mean_C).all() and sd_C < 0.03 * mean_C
         assert mean_C == pytest.approx(track_life(self.discharges, cut_off_V=2.7).prior_q_mobile_C[0], rel=0.03)
+
+    def test_constants_are_held_over_a_life_and_their_doubt_counts_at_other_loads(self):
+        settings = Settings(method="least-squares", cell_rates_sd={}), Settings(method="least-squares")
+        held, unsure = (track_life(self.discharges, 2.7, each.calibrator()) for each in settings)
+        by_default = track_life(self.discharges, 2.7)
+        pd.testing.assert_frame_equal(by_default.table, held.table)
+        np.testing.assert_allclose(unsure.table["q_mobile_C"], held.table["q_mobile_C"], rtol=0.002)
+        assert by_default.sd_share == unsure.sd_share == by_default.after(2).sd_share > 1.2 * held.sd_share
 
     def test_what_contradicts_is_left_out_and_the_others_count(self):
         first, second, third, fourth = self.discharges

@@ -1,9 +1,8 @@
-"""Where the load of a record begins and ends, when it is switched, and how many errors of the model its charge shows."""
+"""Where the load of a record begins and ends, and when it is switched."""
 
 import numpy as np
 import pytest
 
-from battery_env.electrochemistry.model_error import MORE_ERRORS, independent_errors, memory_share
 from battery_env.records import is_load, load_span, switches
 
 TIME_S = 10.0 * np.arange(200)
@@ -47,9 +46,3 @@ def test_noise_and_offset_at_rest_are_no_load(offset_A, noise_A):
 def test_a_drift_is_no_switch():
     assert switches(np.linspace(1.0, 2.0, 200)).tolist() == []
     assert switches(current_A((10, 0.0), (100, 2.0))).tolist() == [9, 109]
-
-
-def test_so_many_errors_of_the_model_are_independent():
-    whole = [independent_errors(6000.0, MORE_ERRORS[name] / 6000.0) for name in ("fit", "path")]
-    assert whole == pytest.approx([50.0, 101.0])
-    assert memory_share("forecast") == 0.15
