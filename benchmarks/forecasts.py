@@ -48,8 +48,10 @@ END_OF_LIFE_Ah = 1.4
 MISMATCH, NOISE_V, GAIN_SD, BEFORE, STEP = 0.2, 0.005, 0.005, 8, (-0.002, 0.007)
 #: The cell that simulated ones resemble, by seed.
 SEEDS = {0: "B0005", 1: "B0006"}
-#: Discharges of it that are fitted, and how many of the last of a life.
-FITTED, FITTED_LAST = (0, 83, 167), 3
+#: Discharges of it that are fitted.
+FITTED = (0, 83, 167)
+#: So many of the last discharges of a life are fitted.
+FITTED_LAST = 3
 
 FORECAST, UNKNOWN_LOAD, OWN_FIT = "forecast, life known", "the same, load unknown", "forecast, life known and fitted"
 NO_LIFE, NOTHING = "forecast, nothing but the load known", "forecast, nothing known"
@@ -89,7 +91,8 @@ def last_curve(last: Record, seen: Record, load: Load) -> float:
     end_C, end_V = charge_C[-1], last.voltage_V[-1]
     slope_V = 0.5 * end_C * (end_V - last.voltage_V[-5]) / (end_C - charge_C[-5])
     curve_C, curve_V = np.append(charge_C, 1.5 * end_C), np.append(last.voltage_V, end_V + slope_V)
-    more_A, lower_V = (seen.current_A - usual_A)[1:], np.interp(seen_C[1:], curve_C, curve_V) - seen.voltage_V[1:]
+    more_A = (seen.current_A - usual_A)[1:]
+    lower_V = np.interp(seen_C[1:], curve_C, curve_V) - seen.voltage_V[1:]
     # at the load of the last one a resistance says nothing
     resistance_ohm = max(float(lower_V @ more_A) / float(more_A @ more_A + 4e-4 * len(more_A)), 0.0)
     since_s = np.arange(_LONGEST_S)
