@@ -18,7 +18,7 @@ seed 0; B0006 and seed 1 were not looked at for it.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -53,9 +53,12 @@ FITTED = (0, 83, 167)
 #: So many of the last discharges of a life are fitted.
 FITTED_LAST = 3
 
-FORECAST, UNKNOWN_LOAD, OWN_FIT = "forecast, life known", "the same, load unknown", "forecast, life known and fitted"
+FORECAST, UNKNOWN_LOAD = "forecast, life known", "the same, load unknown"
+OWN_FIT = "forecast, life known and fitted"
 NO_LIFE, NOTHING = "forecast, nothing but the load known", "forecast, nothing known"
 _LONGEST_S = 20_000.0
+#: How a cell is looked at of which nothing is known.
+NEW = Settings(cut_off_V=CUT_OFF_V)
 
 
 def step_load(rng: np.random.Generator) -> Load:
@@ -109,15 +112,14 @@ BASELINES: dict[str, Callable[[Record, Record, Load], float]] = {
 }
 
 
+#: What a forecast may know beside the load: settings, and the life of the cell.
+Known = tuple[Settings, Life | None]
+
+
 def ends(
-    last: Record,
-    running: Discharge,
-    prior_C: tuple[float, float],
-    load_after: Callable[[float], Load],
-    end_s: float,
-    fitted: Settings | None = None,
+    last: Record, running: Discharge, knows: Mapping[str, Known], load_after: Callable[[float], Load], end_s: float
 ) -> Iterator[dict[str, object]]:
-    """What every method says of a discharge, at each share of it; with what was fitted to its life, if that was."""
+    """What every method says of a discharge, at each share of it."""
     start_s = running.load_on_time_s
     percent = 100.0 / (end_s - start_s)
     for share in SHARES:
@@ -126,13 +128,10 @@ def ends(
         load = load_after(float(record.time_s[-1]))
         for name, baseline in BASELINES.items():
             yield {"method": name, "share": share, "error_percent": percent * (baseline(last, record, load) - end_s)}
-        carried = Settings(cut_off_V=CUT_OFF_V, prior_q_mobile_C=prior_C)
-        new = Settings(cut_off_V=CUT_OFF_V)
-        cases = {FORECAST: (carried, load), UNKNOWN_LOAD: (carried, None), NO_LIFE: (new, load), NOTHING: (new, None)}
-        if fitted is not None:
-            cases[OWN_FIT] = (fitted, load)
-        for name, (settings, known) in cases.items():
-            low_s, median_s, high_s = forecast_end(seen, settings, known, SAMPLES).eod_quantile_s(BAND)
+        asked: list[tuple[str, Known, Load | None]] = [(name, known, load) for name, known in knows.items()]
+        asked += [(UNKNOWN_LOAD, knows[FORECAST], None), (NOTHING, knows[NO_LIFE], None)]
+        for name, (settings, life), to_come in asked:
+            low_s, median_s, high_s = forecast_end(seen, settings, to_come, SAMPLES, life).eod_quantile_s(BAND)
             yield {
                 "method": name,
                 "share": share,
@@ -152,8 +151,8 @@ def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int) ->
     for n in tqdm(range(1, len(discharges), every), desc=cell, unit="discharge", file=sys.stderr):
         running, last = discharges[n], discharges[n - 1].loaded_part(CUT_OFF_V)
         current_A = float(running.loaded_part(CUT_OFF_V).current_A[-1])
-        prior_C, end_s = life.after(n).prior_q_mobile_C, running.eod_time_s(CUT_OFF_V)
-        said = ends(last, running, prior_C, partial(_held, constant(current_A, "current")), end_s)
+        knows, end_s = {FORECAST: (NEW, life.after(n)), NO_LIFE: (NEW, None)}, running.eod_time_s(CUT_OFF_V)
+        said = ends(last, running, knows, partial(_held, constant(current_A, "current")), end_s)
         rows += [{"data": cell, "load": "2 A", "discharge": n + 1} | row for row in said]
     return rows
 
@@ -178,16 +177,19 @@ def simulated_rows(kind: str, seed: int, fit: CellFit, count: int) -> list[dict[
             noise_V, true_end_s = NOISE_V * rng.standard_normal(len(whole.time_s)), whole.reached_s(CUT_OFF_V)
             records.append(Discharge(whole.time_s, whole.voltage_V + noise_V, gain * whole.current_A, starts_at_rest=True))
         *before, running = records
-        life, own = track_life(before, CUT_OFF_V), fit_cell(before[-FITTED_LAST:], CUT_OFF_V)
-        fitted_C = track_life(before, CUT_OFF_V, own.calibrator()).prior_at_other_loads_C
+        own = fit_cell(before[-FITTED_LAST:], CUT_OFF_V)
+        knows: dict[str, Known] = {
+            FORECAST: (NEW, track_life(before, CUT_OFF_V)),
+            NO_LIFE: (NEW, None),
+            OWN_FIT: (Settings(cell=own), track_life(before, CUT_OFF_V, own.calibrator())),
+        }
 
         def rest_of(now_s: float, whole: Load = load) -> Load:
             later = whole.start_s > now_s
             values = np.append(whole(np.array([now_s])), whole.value[later])
             return Load(np.append(0.0, whole.start_s[later] - now_s), values, "current")
 
-        fitted = Settings(cell=own, prior_q_mobile_C=fitted_C, cell_rates_sd={})
-        said = ends(before[-1].loaded_part(CUT_OFF_V), running, life.prior_at_other_loads_C, rest_of, true_end_s, fitted)
+        said = ends(before[-1].loaded_part(CUT_OFF_V), running, knows, rest_of, true_end_s)
         rows += [{"data": f"like {SEEDS[seed]}, seed {seed}", "load": kind, "discharge": n} | row for row in said]
     return rows
 

@@ -187,8 +187,11 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
 def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
     """The life of a cell, by whole discharges that are looked at as the next one is."""
     known = replace(settings, method="least-squares", initial_soc=1.0)
-    held, unsure = replace(known, cell_rates_sd={}).calibrator(), known.calibrator()
-    assert isinstance(held, LeastSquares) and isinstance(unsure, LeastSquares)
+    # all discharges have the same constants, whatever these are
+    held = replace(known, cell_rates_sd={}).calibrator()
+    unsure = known.calibrator()
+    assert isinstance(held, LeastSquares)
+    assert isinstance(unsure, LeastSquares)
     return _track(discharges, settings.cut_off_V, held, unsure)
 
 

@@ -143,17 +143,21 @@ class TestUncertainty:
         assert self.width(unknown, 8.0) > 1.5 * self.width(known, 8.0)
 
     def test_what_a_resistance_absorbed_of_the_error_of_the_model_comes_out_under_another_load(self):
-        unsure, error_ohm = Estimate(6000.0, 0.15, 0.0, 0.05 / 4.0), 0.05 / 4.0
+        error_ohm = 0.05 / 4.0
+        unsure = Estimate(6000.0, 0.15, 0.0, error_ohm)
         # at the load of the record the voltage makes up for a larger resistance, and at a lighter one for too much
         low_s, high_s = (
             forecast(self.record, Estimate(6000.0, r_o), 1.0, model=MODEL, mismatch_V=0.05, samples=400).eod_quantile_s(0.5)
             for r_o in 0.15 + error_ohm * np.array([-1.0, 1.0])
         )
-        own_s, absorbed_s = 3.29 * 0.5 * (high_s - low_s) * np.array([1.0, np.sqrt(WHOLE_ERROR**2 - 1.0)])
+        own_s = 3.29 * 0.5 * (high_s - low_s)
+        # beside what the estimate states, however sure that is
+        absorbed_s = np.sqrt(WHOLE_ERROR**2 - 1.0) * own_s
         sure_s = self.width(TRUTH, 1.0, mismatch_V=0.05)
         assert absorbed_s < sure_s < 1.5 * absorbed_s
         assert self.width(unsure, 1.0, mismatch_V=0.05) == pytest.approx(np.hypot(own_s, sure_s), rel=0.1)
         assert self.width(unsure, mismatch_V=0.05) == pytest.approx(self.width(TRUTH, mismatch_V=0.05), rel=0.1)
+        # what is told of the resistance is the estimate
         assert forecast(self.record, unsure, 8.0, model=MODEL).r_o.std() == pytest.approx(error_ohm, rel=0.1)
 
     def test_of_a_filter_the_end_is_the_one_that_it_states(self):
