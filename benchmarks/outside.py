@@ -8,10 +8,10 @@ LAC beside SAC, TD3 and TQC on tasks of Gymnasium, which nobody here made or tun
   python -m benchmarks.outside --merge rows/runs.csv --redraw
 
 Every algorithm has its defaults, but SAC, TD3 and TQC those settings of the RL Zoo that are tuned for a task with at most 50
-thousand steps. ``lac_common`` is LAC with its one setting for control problems. The critics of ``lac_fourth_root`` learn that
-root, and of those the weight of the entropy begins at 1 in ``lac_higher_start``, as SAC's does. A policy is judged by its mean
-action, in 20 episodes that no training starts with. A training that is done is a row of ``runs.csv``, which nothing but a
-change of what was run makes anew. The same command goes on from there.
+thousand steps; ``lac_zoo`` is LAC with those of SAC. ``lac_common`` is LAC with its one setting for control problems. The
+critics of ``lac_fourth_root`` learn that root, and of those the weight of the entropy begins at 1 in ``lac_higher_start``, as
+SAC's does. A policy is judged by its mean action, in 20 episodes that no training starts with. A training that is done is a
+row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command goes on from there.
 """
 
 from __future__ import annotations
@@ -45,18 +45,20 @@ TASKS = {
     "Hopper-v5": 50_000,
 }
 _FOURTH_ROOT = {"policy_kwargs": "dict(root=4)"}
-#: Algorithms by their names on the command line: what readers call them, the class, and what differs from its defaults.
-ALGORITHMS: dict[str, tuple[str, str, dict[str, Any]]] = {
+#: Algorithms by their names on the command line: what readers call them, the class, and what differs from its defaults; None
+#: is for those that are trained only where TUNED has settings.
+ALGORITHMS: dict[str, tuple[str, str, dict[str, Any] | None]] = {
     "lac": ("LAC", "sb3_lac:LAC", {}),
     "published_lac": ("LAC as published", "sb3_lac:PublishedLAC", {}),
     "lac_common": ("LAC (root=4), its one setting", "sb3_lac:LAC", setting_of_lac()),
+    "lac_zoo": ("LAC, the RL Zoo's settings of SAC", "sb3_lac:LAC", None),
     "lac_fourth_root": ("LAC (root=4)", "sb3_lac:LAC", _FOURTH_ROOT),
     "lac_higher_start": ("LAC (root=4), entropy from 1", "sb3_lac:LAC", {"ent_coef": "auto", **_FOURTH_ROOT}),
     "sac": ("SAC", "stable_baselines3:SAC", {}),
     "td3": ("TD3", "stable_baselines3:TD3", {}),
     "tqc": ("TQC", "sb3_contrib:TQC", {}),
 }
-OURS = ("lac", "lac_fourth_root")
+OURS = ("lac", "lac_fourth_root", "lac_zoo")
 RIVALS = ("sac", "td3", "tqc")
 _CAR = {
     "learning_rate": 3e-4,
@@ -88,7 +90,7 @@ TUNED: dict[str, dict[str, dict[str, Any]]] = {
         },
         "tqc": {"learning_rate": 1e-3},
     },
-    "MountainCarContinuous-v0": {"sac": _CAR, "tqc": _CAR},
+    "MountainCarContinuous-v0": {"lac_zoo": _CAR, "sac": _CAR, "tqc": _CAR},
 }
 EPISODES = 20
 _CURVE = {100 * point // POINTS: f"after_{100 * point // POINTS}_percent" for point in range(1, POINTS + 1)}
@@ -98,7 +100,7 @@ RETURN = _CURVE[100]
 def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -> Run:
     """A training of this study."""
     _, kind, settings = ALGORITHMS[algorithm]
-    return Run(task, algorithm, kind, seed, timesteps or TASKS[task], TUNED.get(task, {}).get(algorithm, settings))
+    return Run(task, algorithm, kind, seed, timesteps or TASKS[task], TUNED.get(task, {}).get(algorithm, settings or {}))
 
 
 def mean_return(model: OffPolicyAlgorithm, run: Run) -> float:
@@ -218,6 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     runs = [
         run_of(task, algorithm, seed, chosen.timesteps)
         for seed, task, algorithm in product(chosen.seeds, in_order, chosen.algos)
+        if ALGORITHMS[algorithm][2] is not None or algorithm in TUNED.get(task, {})
     ]
     done = make_rows(study, runs, mean_return)
     compared = comparison(done)

@@ -11,6 +11,8 @@ from torch._inductor.pattern_matcher import Arg, CallFunction, Match, PatternMat
 
 _aten = th.ops.aten
 _passes = PatternMatcherPass(pass_name="sb3_lac")
+# MKL is slow where the columns of a product, as those of an observation, are no multiple of this
+_BLOCK = 16
 
 
 def _product(left: th.Tensor, right: th.Tensor) -> th.Tensor:
@@ -19,12 +21,9 @@ def _product(left: th.Tensor, right: th.Tensor) -> th.Tensor:
         return (left * right.t()).sum(dim=1, keepdim=True)
     if left.shape[0] == 1:
         return (left.t() * right).sum(dim=0, keepdim=True)
-    return left * right if left.shape[1] == 1 else left @ right
-
-
-def _is_thin(match: Match) -> bool:
-    left, right = (each.meta["val"].shape for each in match.args)
-    return 1 in (*left, *right)
+    if left.shape[1] == 1:
+        return left * right
+    return (right.t() @ left.t()).t() if right.shape[1] % _BLOCK and right.shape[1] < left.shape[0] else left @ right
 
 
 def _is_number(match: Match) -> bool:
@@ -32,7 +31,7 @@ def _is_number(match: Match) -> bool:
     return base > 0 and exponent.meta["val"].dim() == 0
 
 
-@register_graph_pattern(CallFunction(_aten.mm.default, Arg(), Arg()), extra_check=_is_thin, pass_dict=_passes)
+@register_graph_pattern(CallFunction(_aten.mm.default, Arg(), Arg()), pass_dict=_passes)
 def _replace_product(match: Match, left: th.fx.Node, right: th.fx.Node) -> None:
     match.replace_by_example(_product, [left, right])
 
@@ -62,5 +61,6 @@ class _SmallNetworks(CustomGraphPass):
 
 def compile_for_cpu(traced: th.fx.GraphModule, inputs: Sequence[th.Tensor]) -> Any:
     """Make code of a graph, with a loop of calls in C++."""
-    options = {"cpp_wrapper": True, "post_grad_custom_post_pass": _SmallNetworks()}
+    # Shapes are those that the update was traced with: to ask all of them anew takes longer than a layer
+    options = {"cpp_wrapper": True, "size_asserts": False, "post_grad_custom_post_pass": _SmallNetworks()}
     return compile_fx(traced, inputs, config_patches=options)
