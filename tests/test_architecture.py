@@ -259,8 +259,7 @@ def test_no_function_is_long_and_no_private_name_leaves_its_module(path):
 #: The most of each that there may be, and no more than there is. It may fall, and its number with it. To raise one takes a
 #: sentence beside it that names the user who needs it, and what went for it.
 MOST = {
-    # 196 for the page: whoever writes no code and has a file that is read wrongly, and the owner of a shared machine, whom a
-    # secret address and the process that removes files protect; what the command did of it is shared, and nothing else went.
+    # 196 for the page: whoever writes no code, and the owner of a shared machine; nothing went.
     # 247 lines and 3 numbers for the error that drifts and for steps of the voltage: engineers with worn cells, whose slow
     # diffusion was stated as R_o, and with records that lost rows; the formula of one common error went. 11 for exports of
     # millions of rows with a clock as text; the rule for cycles of impossible currents went. 75 for engineers whose load is
@@ -276,8 +275,7 @@ MOST = {
     # 2 for who asks for the end at another load: what a fit to the life tells of it; a curve that is stretched went.
     # 3 for who asks whether LAC learns a task that SAC's settings are tuned for: LAC with the same ones
     ("lines", "benchmarks"): 6_180,
-    # the same users: the page is started, asked by strangers, killed, and looked at in a browser;
-    # and gaps between pulses, and lives in the order of their dates
+    # the same users: the page, gaps between pulses, and lives in the order of their dates
     # 70 for who trains with a square root, and for the question whether a critic learns the exact value, which had gone with
     # tests that say what others say. 9 for the end at another load
     ("lines", "tests"): 17_322,
