@@ -42,7 +42,7 @@ TASKS = {
     "InvertedDoublePendulum-v5": 20_000,
     "Reacher-v5": 10_000,
     "Pusher-v5": 10_000,
-    "Hopper-v5": 50_000,
+    "Hopper-v5": 20_000,
 }
 _FOURTH_ROOT = {"policy_kwargs": "dict(root=4)"}
 #: Algorithms by their names on the command line: what readers call them, the class, and what differs from its defaults; None
