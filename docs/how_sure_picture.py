@@ -64,7 +64,7 @@ def main() -> None:
     doubt.semilogy(100.0 * shares[:-1], 100.0 * np.transpose(rows)[5][:-1], "x", color="0.4", label="how far off it was")
     doubt.axhline(100.0 * SETTLED_SHARES["q_mobile"], color="0.4", lw=1.0, ls="--")
     doubt.annotate("settled below", (40.0, 110.0 * SETTLED_SHARES["q_mobile"]), fontsize=8)
-    doubt.set_ylim(1e-2, 50.0)
+    doubt.set_ylim(1e-2, 100.0)
     doubt.set_xlabel("seen of the discharge (% of its time)")
     doubt.set_ylabel("standard deviation of q_max (%)")
     doubt.legend(frameon=False, fontsize=8, loc="lower left")

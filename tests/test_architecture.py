@@ -259,15 +259,14 @@ def test_no_function_is_long_and_no_private_name_leaves_its_module(path):
 #: The most of each that there may be, and no more than there is. It may fall, and its number with it. To raise one takes a
 #: sentence beside it that names the user who needs it, and what went for it.
 MOST = {
-    # 196 for the page: whoever writes no code, and the owner of a shared machine; nothing went.
-    # 247 lines and 3 numbers for the error that drifts and for steps of the voltage: engineers with worn cells, whose slow
-    # diffusion was stated as R_o, and with records that lost rows; the formula of one common error went. 11 for exports of
-    # millions of rows with a clock as text; the rule for cycles of impossible currents went. 75 for engineers whose load is
-    # switched between rows, or whose current drops out: R_o was too sure; a likelihood of each start of a search went. 1 for
-    # lives whose files are not named in the order of their dates, and for settings that are given another cell. 3 for who asks
-    # for the end at another load than that of the life: its constants are held, and their doubt counts; the filter's rule of
-    # loads that go on went
-    ("lines", "battery_env"): 18_272,
+    # 196 for the page: whoever writes no code, and the owner of a shared machine. 247 lines and 3 numbers for the error that
+    # drifts and for steps of the voltage: engineers with worn cells, whose slow diffusion was stated as R_o, and with records
+    # that lost rows; the formula of one common error went. 11 for exports of millions of rows with a clock as text; a rule for
+    # cycles went. 75 for engineers whose load is switched between rows, or whose current drops out: R_o was too sure; a
+    # likelihood of each start of a search went. 1 for lives whose files are not named in the order of their dates. 3 for who
+    # asks for the end at another load than that of the life: its constants are held; a rule of the filter went. 51 and a
+    # number for who asks least squares before the knee is complete: q_mobile was too sure; nothing went
+    ("lines", "battery_env"): 18_323,
     # 7 for who trains where chance decides on crashes: a square root; two ways to write a file whole became one
     ("lines", "sb3_lac"): 6_890,
     # 33 for who asks what LAC loses on tasks of others and on a plant that changes: a table, intervals, a picture, and whether
@@ -279,7 +278,7 @@ MOST = {
     # 70 for who trains with a square root, and for the question whether a critic learns the exact value, which had gone with
     # tests that say what others say. 9 for the end at another load
     ("lines", "tests"): 17_322,
-    ("numbers at the top of modules", "battery_env"): 189,
+    ("numbers at the top of modules", "battery_env"): 190,
     # 1 for who trains small networks, compiled: the columns that a product of MKL is slow without; a check went
     ("numbers at the top of modules", "sb3_lac"): 21,
     ("starred calls", "battery_env"): 44,

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES, AgingPath
@@ -22,7 +21,7 @@ from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.reasons import Reason
-from battery_env.estimators.search import MARGIN, Fit, JointPrior, Prior, Search, square
+from battery_env.estimators.search import MARGIN, Fit, JointPrior, Prior, Search, root_inverse_diagonal, square
 from battery_env.estimators.verdict import (
     MOST_NOISE_SD,
     PRIOR_LIMIT_SD,
@@ -60,8 +59,9 @@ class _Fitted:
     def sd(self, fit: Fit, ratios: Mapping[str, float]) -> dict[str, float]:
         """The standard deviations of a fit, so many times as large as it says, with those of what does not show."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
-        for name, root in zip(self.search.parameters, _root_inverse_diagonal(fit.jacobian), strict=False):
-            sd[name] = hypot(ratios.get(name, 1.0) * sqrt(self.variance) * float(root), self.hidden_sd[name])
+        for name, root in zip(self.search.parameters, root_inverse_diagonal(fit.jacobian), strict=False):
+            ratio = ratios.get(name, 1.0) * (fit.spread if name == "q_mobile" else 1.0)
+            sd[name] = hypot(ratio * sqrt(self.variance) * float(root), self.hidden_sd[name])
         return sd
 
 
@@ -84,7 +84,8 @@ class LeastSquares(Estimator):
     *Standard deviations* follow from one likelihood (:mod:`~battery_env.estimators.error`). With ``mismatch_V`` of 0 the
     residuals are white, as of simulated records with noise. On a real cell they are the model's error, which a fit of half a
     discharge hides in its parameters. So an error of twice ``mismatch_V``, the error expected of the model, drifts along the
-    charge drawn, beside white noise. More samples do not average it out.
+    charge drawn, beside white noise. More samples do not average it out. That of ``q_mobile`` is as wide as the likelihood,
+    and not as its curvature: where a knee begins a much larger ``q_mobile`` is hardly less likely.
 
     *Nuisance constants* are not known exactly, and are estimated along with the parameters, each under a prior of its own; so
     can be an offset of the voltage sensor. Slow diffusion looks like a smaller ``q_mobile``, and slow kinetics like a larger
@@ -259,6 +260,8 @@ class LeastSquares(Estimator):
         search = replace(search, error=error)
         alone = fit = search.best(starts, priors)
         variance = 1.0 if noise_V else square(alone.residual_V) / (len(alone.residual_V) - len(self.parameters))
+        if "q_mobile" in self.parameters:
+            alone = fit = replace(alone, spread=search.spread(alone, priors, variance))
         if self.path is not None:
             # what goes together along the path is a prior of q_mobile too, on which a settled estimate must not rest
             loose = np.pad(np.diag(1.0 / np.array(list(self.nuisance.values()))), ((0, 0), (len(self.parameters), 0)))
@@ -270,6 +273,7 @@ class LeastSquares(Estimator):
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance) / sd_C)
             fit = search.best([*starts, alone.values, *search.starts([mean_C])[0]], [*priors, carried])
+            fit = replace(fit, spread=search.spread(fit, [*priors, carried], variance))
         evidence = self._evidence(record, history, fit)
         return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, unseen_C(evidence)), evidence)
 
@@ -331,7 +335,7 @@ class LeastSquares(Estimator):
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
         known = Assumptions(self.current_gain_sd, sd_soc / soc, is_along_path=self.path is not None)
         # where the record has it and where a prior has moved it: beside its knee the voltage says little of q_mobile
-        moved_there = replace(fit, jacobian=np.vstack([fit.jacobian[:n], alone.jacobian[n:]]))
+        moved_there = replace(alone, jacobian=np.vstack([fit.jacobian[:n], alone.jacobian[n:]]))
         own_sds = [fitted.sd(each, {"q_mobile": self._sd_ratio}) for each in (alone, moved_there)]
         return diagnosis.verdict(alone.values, {name: max(sd[name] for sd in own_sds) for name in free}, free, priors, known)
 
@@ -362,11 +366,3 @@ def _starts_along(path: AgingPath, search: Search) -> list[dict[str, float]]:
         start["q_mobile"] = max(start["q_mobile"], search.least_q_at_C(start)[0] * float(np.exp(_START_ABOVE)))
         starts.append(start)
     return starts
-
-
-def _root_inverse_diagonal(jacobian: FloatArray) -> FloatArray:
-    """The roots of the diagonal of (J^T J)^-1; infinite where the data do not determine the parameters."""
-    try:
-        return np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
-    except np.linalg.LinAlgError:
-        return np.full(jacobian.shape[1], np.inf)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from math import inf, isnan, log
+from math import exp, inf, isnan, log, sqrt
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,9 @@ _START_EXCESS = 0.003 * 2.2 ** np.arange(13)
 _RIVAL_RATIO, _FINER = 2.0, 4
 # Starts are compared on a coarse grid of time if it has at least this many points.
 _COARSE_POINTS = 100
+# Steps in which a likelihood is followed, in standard deviations, how many at most, and how far its logarithm falls in one, if
+# it is normal.
+_STEP_SD, _STEPS, _FALL = 0.5, 100, 0.5
 
 
 def minimized(
@@ -148,6 +151,7 @@ class Fit:
     residual_V: FloatArray  # at the samples
     square: float  # of all residuals as they are weighed
     at_bound: tuple[str, ...]  # which parameters are
+    spread: float = 1.0  # how many times as wide as its curvature says the likelihood of q_mobile is
 
 
 @dataclass(frozen=True)
@@ -280,6 +284,47 @@ class Search:
         at_bound = tuple(name for name in self.parameters if values[name] in self._bounds_at(values)[name])
         return Fit(values, jacobian, self.residual(values)[0], square(residual), at_bound)
 
+    def spread(self, fit: Fit, priors: Sequence[Prior | JointPrior], variance: float) -> float:
+        """
+        How many times as wide as its curvature says the likelihood of ``q_mobile`` is, between the points where it has fallen
+        as a normal one does in a standard deviation; at least 1. It is adjusted for the other unknowns (Cox and Reid 1987),
+        which follow from point to point by a step of Gauss and Newton.
+        """
+        column, best_C, least_C = self.unknown.index("q_mobile"), fit.values["q_mobile"], self.least_q_at_C(fit.values)[0]
+        sd_C = sqrt(variance) * float(root_inverse_diagonal(fit.jacobian)[column])
+        if not 0.0 < sd_C < inf or fit.at_bound:
+            return 1.0
+        names = [name for name in self.unknown if name != "q_mobile"]
+
+        def adjusted(values: dict[str, float]) -> tuple[float, dict[str, float]]:
+            residual, jacobian = self.weighed(values, priors)
+            others = np.delete(jacobian, column, axis=1)
+            change = np.linalg.lstsq(others, -residual, rcond=None)[0]
+            left = square(residual + others @ change) / variance + np.linalg.slogdet(others.T @ others)[1]
+            return -0.5 * left, values | {name: values[name] + float(each) for name, each in zip(names, change, strict=True)}
+
+        best = adjusted(fit.values)
+        highest, ends_C = best[0], []
+        for side in (-1, 1):
+            (height, values), q_C = best, best_C
+            for way_C in _STEP_SD * sd_C * np.arange(1, _STEPS):
+                before, before_C = height, q_C
+                # upward a likelihood may be flat: steps grow along with the distance to the least value
+                q_C = best_C - way_C if side < 0 else least_C + (best_C - least_C) * exp(way_C / (best_C - least_C))
+                bounds_C = self._bounds_at(values)["q_mobile"]
+                if _within(q_C, bounds_C) != q_C:
+                    q_C = _within(q_C, bounds_C)
+                    break
+                height, values = adjusted(values | {"q_mobile": q_C})
+                highest = max(highest, height)
+                if height < highest - _FALL:
+                    # of a normal likelihood the root of its fall is linear in the distance
+                    fallen = sqrt(highest - before), sqrt(highest - height)
+                    q_C = float(np.interp(sqrt(_FALL), fallen, (before_C, q_C)))
+                    break
+            ends_C.append(q_C)
+        return max((ends_C[1] - ends_C[0]) / (2.0 * sd_C), 1.0)
+
     def _bounds_at(self, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Of all that has any; how slow the diffusion is moves the least ``q_mobile``."""
         (low_C, high_C), least_C = self.bounds["q_mobile"], self.least_q_at_C(values)[0]
@@ -402,6 +447,14 @@ def spread_over(length: int, count: int) -> IntArray:
 def square(array: FloatArray) -> float:
     """Sum of squares."""
     return float(array @ array)
+
+
+def root_inverse_diagonal(jacobian: FloatArray) -> FloatArray:
+    """The roots of the diagonal of (J^T J)^-1; infinite where the data do not determine the parameters."""
+    try:
+        return np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    except np.linalg.LinAlgError:
+        return np.full(jacobian.shape[1], np.inf)
 
 
 def _within(value: float, limits: tuple[float, float]) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import ndtr, ndtri
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_not_negative, check_positive, check_whole_number
@@ -166,9 +167,9 @@ def forecast(
     Each sample is a cell with its own parameters, its own error of the model, and its own load if that is random. All follow
     the record and then the load, down to the cut-off, for a week at most.
 
-    *Parameters* are drawn from the estimate and its standard deviations: ``q_mobile`` log-normal, above what the record has
-    already taken out of the cell; ``r_o`` normal, with the correlation that the voltage of this record gives it with
-    ``q_mobile``. Standard deviations of NaN count as zero, and ``notes`` say so.
+    *Parameters* are drawn from the estimate and its standard deviations: ``q_mobile`` log-normal, half of it below the
+    estimate, and above what the record has already taken out of the cell; ``r_o`` normal, with the correlation that the
+    voltage of this record gives it with ``q_mobile``. Standard deviations of NaN count as zero, and ``notes`` say so.
 
     *The error of the model* has the standard deviation ``mismatch_V``. Shortly before the end of the record it is the mean
     difference between measured voltage and that of the sample, so that samples of any resistance agree with what was
@@ -348,9 +349,10 @@ def _draw_parameters(
         )
     deviation = np.zeros(samples)
     if share > 0.0:
-        from scipy.stats import truncnorm  # slow to import, and a whole discharge needs none
-
-        deviation = truncnorm.rvs(low / share, high / share, size=samples, random_state=rng)
+        # what is cut off below the estimate makes none above it more likely
+        least, most = ndtr([low / share, high / share])
+        middle, chance = 0.5 if least < 0.5 else 0.5 * (least + most), rng.uniform(-1.0, 1.0, samples)
+        deviation = ndtri(middle + chance * np.where(chance < 0.0, middle - least, most - middle))
     # at a given voltage a larger q_mobile goes with a larger r_o
     _, by_q, by_r = model.sensitivities(current_A, max(q_C, 1.01 * least_C), r_ohm)
     known = np.isfinite(by_q) & np.isfinite(by_r)
