@@ -23,7 +23,9 @@ def _product(left: th.Tensor, right: th.Tensor) -> th.Tensor:
         return (left.t() * right).sum(dim=0, keepdim=True)
     if left.shape[1] == 1:
         return left * right
-    return (right.t() @ left.t()).t() if right.shape[1] % _BLOCK and right.shape[1] < left.shape[0] else left @ right
+    if right.shape[1] % _BLOCK and right.shape[1] < left.shape[0]:
+        return (right.t() @ left.t()).t()
+    return left @ right
 
 
 def _is_number(match: Match) -> bool:

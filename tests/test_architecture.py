@@ -259,26 +259,31 @@ def test_no_function_is_long_and_no_private_name_leaves_its_module(path):
 #: The most of each that there may be, and no more than there is. It may fall, and its number with it. To raise one takes a
 #: sentence beside it that names the user who needs it, and what went for it.
 MOST = {
-    # 196 for the page: whoever writes no code, and the owner of a shared machine. 247 lines and 3 numbers for the error that
-    # drifts and for steps of the voltage: engineers with worn cells, whose slow diffusion was stated as R_o, and with records
-    # that lost rows; the formula of one common error went. 11 for exports of millions of rows with a clock as text; a rule for
-    # cycles went. 75 for engineers whose load is switched between rows, or whose current drops out: R_o was too sure; a
-    # likelihood of each start of a search went. 1 for lives whose files are not named in the order of their dates. 3 for who
-    # asks for the end at another load than that of the life: its constants are held; a rule of the filter went. 51 and a
-    # number for who asks least squares before the knee is complete: q_mobile was too sure; nothing went
-    ("lines", "battery_env"): 18_323,
-    # 7 for who trains where chance decides on crashes: a square root; two ways to write a file whole became one
-    ("lines", "sb3_lac"): 6_890,
+    # 196 for the page: whoever writes no code and has a file that is read wrongly, and the owner of a shared machine, whom a
+    # secret address and the process that removes files protect; what the command did of it is shared, and nothing else went.
+    # 247 lines and 3 numbers for the error that drifts and for steps of the voltage: engineers with worn cells, whose slow
+    # diffusion was stated as R_o, and with records that lost rows; the formula of one common error went. 11 for exports of
+    # millions of rows with a clock as text; the rule for cycles of impossible currents went. 75 for engineers whose load is
+    # switched between rows, or whose current drops out: R_o was too sure; a likelihood of each start of a search went. 1 for
+    # lives whose files are not named in the order of their dates, and for settings that are given another cell. 3 for who asks
+    # for the end at another load than that of the life: its constants are held, and their doubt counts; the filter's rule of
+    # loads that go on went
+    # 57 and 3 numbers for who asks least squares before the knee is complete: q_mobile was too sure; nothing went
+    ("lines", "battery_env"): 18_329,
+    # 7 for who trains where chance decides on crashes: a square root; two ways to write a file whole became one.
+    # 2 for who trains small networks, compiled; nothing went
+    ("lines", "sb3_lac"): 6_892,
     # 33 for who asks what LAC loses on tasks of others and on a plant that changes: a table, intervals, a picture, and whether
     # a square root helps; a table of settings beside that of the algorithms went. 8 for who repeats a study of LAC: its root.
     # 2 for who asks for the end at another load: what a fit to the life tells of it; a curve that is stretched went.
     # 3 for who asks whether LAC learns a task that SAC's settings are tuned for: LAC with the same ones
     ("lines", "benchmarks"): 6_180,
-    # the same users: the page, gaps between pulses, and lives in the order of their dates
+    # the same users: the page is started, asked by strangers, killed, and looked at in a browser;
+    # and gaps between pulses, and lives in the order of their dates
     # 70 for who trains with a square root, and for the question whether a critic learns the exact value, which had gone with
-    # tests that say what others say. 9 for the end at another load
-    ("lines", "tests"): 17_322,
-    ("numbers at the top of modules", "battery_env"): 190,
+    # tests that say what others say. 9 for the end at another load. 5 for the sentences that name these users
+    ("lines", "tests"): 17_327,
+    ("numbers at the top of modules", "battery_env"): 192,
     # 1 for who trains small networks, compiled: the columns that a product of MKL is slow without; a check went
     ("numbers at the top of modules", "sb3_lac"): 21,
     ("starred calls", "battery_env"): 44,

@@ -38,9 +38,12 @@ _START_EXCESS = 0.003 * 2.2 ** np.arange(13)
 _RIVAL_RATIO, _FINER = 2.0, 4
 # Starts are compared on a coarse grid of time if it has at least this many points.
 _COARSE_POINTS = 100
-# Steps in which a likelihood is followed, in standard deviations, how many at most, and how far its logarithm falls in one, if
-# it is normal.
-_STEP_SD, _STEPS, _FALL = 0.5, 100, 0.5
+# Steps in which a likelihood is followed, in standard deviations.
+_STEP_SD = 0.5
+# So many of them at most.
+_STEPS = 100
+# How far the logarithm of a normal likelihood falls in a standard deviation.
+_FALL = 0.5
 
 
 def minimized(
@@ -290,7 +293,9 @@ class Search:
         as a normal one does in a standard deviation; at least 1. It is adjusted for the other unknowns (Cox and Reid 1987),
         which follow from point to point by a step of Gauss and Newton.
         """
-        column, best_C, least_C = self.unknown.index("q_mobile"), fit.values["q_mobile"], self.least_q_at_C(fit.values)[0]
+        column = self.unknown.index("q_mobile")
+        best_C = fit.values["q_mobile"]
+        least_C, _ = self.least_q_at_C(fit.values)
         sd_C = sqrt(variance) * float(root_inverse_diagonal(fit.jacobian)[column])
         if not 0.0 < sd_C < inf or fit.at_bound:
             return 1.0

@@ -351,7 +351,8 @@ def _draw_parameters(
     if share > 0.0:
         # what is cut off below the estimate makes none above it more likely
         least, most = ndtr([low / share, high / share])
-        middle, chance = 0.5 if least < 0.5 else 0.5 * (least + most), rng.uniform(-1.0, 1.0, samples)
+        middle = 0.5 if least < 0.5 else 0.5 * (least + most)
+        chance = rng.uniform(-1.0, 1.0, samples)
         deviation = ndtri(middle + chance * np.where(chance < 0.0, middle - least, most - middle))
     # at a given voltage a larger q_mobile goes with a larger r_o
     _, by_q, by_r = model.sensitivities(current_A, max(q_C, 1.01 * least_C), r_ohm)
