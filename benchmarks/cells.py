@@ -6,21 +6,23 @@ Calibrators on the discharges of two real cells, NASA's B0005 and B0006, whole a
   python -m benchmarks.cells real_cells       # with the constants of the new cell, over the lives of both
   python -m benchmarks.cells fit_cell         # with constants that were fitted to three discharges of the other cell
 
-*Whole*: the voltage between load-on and 2.7 V. *In progress*: its first 25, 50 and 75 % of the time; how far off is the
-predicted end of discharge? Nothing is known of the parameters of a tested cell but what the name of a calibrator says.
+*Whole*: the voltage between load-on and 2.7 V. *In progress*: its first 25 to 98 % of the time; how far off is the predicted
+end of discharge, how far are q_max and R_o from those of the whole discharge, and is that settled? Nothing is known of the
+parameters of a tested cell but what the name of a calibrator says.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import spearmanr
+from scipy.stats import norm, spearmanr
 
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
@@ -35,6 +37,7 @@ from benchmarks.study import (
     Study,
     Tables,
     command_line,
+    digits,
     markdown,
     positive,
     run_named,
@@ -44,7 +47,7 @@ from benchmarks.study import (
 
 CUT_OFF_V = 2.7
 #: Shares of a discharge, in time, after which its end is predicted.
-SHARES = (0.25, 0.5, 0.75)
+SHARES = (0.25, 0.5, 0.75, 0.9, 0.95, 0.98)
 #: Which cell is fitted, and which one tests it.
 PAIRS = (("B0005", "B0006"), ("B0006", "B0005"))
 #: About how far q_mobile moves from one discharge to the next, as a share of it (root mean square, measured here).
@@ -55,30 +58,91 @@ _THERMAL = RecordModel(thermal=True)
 _AGES = {"fresh": 0.0, "middle": 0.5, "aged": 1.0}
 
 
-def estimates(
-    discharge: Discharge, calibrator: Estimator, model: RecordModel, shares: Sequence[float] = SHARES
-) -> list[dict[str, Any]]:
-    """Calibrate to beginnings of a discharge, and predict its end."""
+def whole_row(discharge: Discharge, calibrator: LeastSquares) -> dict[str, Any]:
+    """Calibrate to one whole discharge."""
     record = discharge.loaded_part(CUT_OFF_V)
-    start_s, end_s = record.time_s[[0, -1]]
+    estimate = calibrator.estimate(record)
+    return {
+        "cycle": discharge.meta["cycle"],
+        "capacity_Ah": discharge.meta["capacity_Ah"],
+        "q_mobile_C": estimate.q_mobile,
+        "sd_q_mobile_C": estimate.sd_q_mobile,
+        "r_o_ohm": estimate.r_o,
+        "sd_r_o_ohm": estimate.sd_r_o,
+        "settled": estimate.settled,
+        "duration_s": record.time_s[-1] - record.time_s[0],
+        **misses(record, calibrator.model, estimate),
+    }
+
+
+def misses(record: Discharge, model: RecordModel, parameters: Estimate) -> dict[str, float]:
+    """What a model misses of the voltage, and of the end, of a whole discharge."""
+    forecast = model.forecast(record, parameters, CUT_OFF_V)
+    residual_V = forecast.at_samples_V - record.voltage_V
+    return {
+        "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
+        "eod_error_s": forecast.eod_time_s - record.time_s[-1],
+    }
+
+
+def rows_in_progress(
+    discharge: Discharge, calibrators: Mapping[str, Estimator], model: RecordModel, whole: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """Calibrate to beginnings of a discharge, predict its end, and name what it says as a whole."""
+    record = discharge.loaded_part(CUT_OFF_V)
     rows = []
-    for share in shares:
-        seen = record if share == 1.0 else record.until(start_s + share * (end_s - start_s))
+    for share, (method, calibrator) in product(SHARES, calibrators.items()):
+        seen = record.until(record.time_s[0] + share * whole["duration_s"])
         estimate = calibrator.estimate(seen)
         eod_time_s = model.forecast(seen, estimate, CUT_OFF_V).eod_time_s
         rows.append(
             {
+                "cell": discharge.meta["cell"],
                 "cycle": discharge.meta["cycle"],
-                "capacity_Ah": discharge.meta["capacity_Ah"],
                 "share": share,
+                "method": method,
                 "q_mobile_C": estimate.q_mobile,
                 "sd_q_mobile_C": estimate.sd_q_mobile,
+                "q_mobile_of_whole_C": whole["q_mobile_C"],
                 "r_o_ohm": estimate.r_o,
+                "sd_r_o_ohm": estimate.sd_r_o,
+                "r_o_of_whole_ohm": whole["r_o_ohm"],
                 "settled": estimate.settled,
-                "eod_error_percent": 100.0 * (eod_time_s - end_s) / (end_s - start_s),
+                "eod_error_percent": 100.0 * (eod_time_s - record.time_s[-1]) / whole["duration_s"],
             }
         )
     return rows
+
+
+def progress_table(progress: pd.DataFrame) -> pd.DataFrame:
+    """The summary of discharges in progress; what is settled is judged by the whole discharge."""
+    shown = progress.sort_values(["cell", "share", "method"], kind="stable")
+    shown = shown.assign(
+        seen=shown["share"].map(lambda share: f"{100 * share:.0f}"),
+        error=shown["eod_error_percent"].abs(),
+        sd_percent=100 * shown["sd_q_mobile_C"] / shown["q_mobile_C"],
+    )
+
+    def both(said: Callable[[pd.Series, pd.Series, pd.Series], str]) -> Callable[[pd.DataFrame], str]:
+        names = (("q_mobile", "C"), ("r_o", "ohm"))
+        columns = [[f"{name}_{unit}", f"sd_{name}_{unit}", f"{name}_of_whole_{unit}"] for name, unit in names]
+        return lambda part: " / ".join(said(*(part[column] for column in of_one)) for of_one in columns)
+
+    def inside(value: pd.Series, sd: pd.Series, of_whole: pd.Series) -> str:
+        return share_in_percent((value - of_whole).abs() <= norm.ppf(0.95) * sd)
+
+    def farthest(value: pd.Series, sd: pd.Series, of_whole: pd.Series) -> str:
+        return digits(100 * (value / of_whole - 1.0).abs().max())
+
+    cells: dict[str, Cell] = {
+        "mean abs error of EOD (%)": ("error", lambda errors: f"{errors.mean():.1f}"),
+        "worst (%)": ("error", lambda errors: f"{errors.max():.1f}"),
+        "stated sd of q_mobile (%)": ("sd_percent", lambda percent: f"{percent.median():.1f}"),
+        "q_mobile / r_o inside 90 % (%)": both(inside),
+        "settled (%)": ("settled", share_in_percent),
+        "of these q_mobile / r_o off at most (%)": lambda part: both(farthest)(part[part["settled"]]),
+    }
+    return table_of(shown, {"cell": "cell", "seen": "seen (%)", "method": "method"}, cells)
 
 
 def least_squares(prior_q_mobile_C: float | None = None) -> LeastSquares:
@@ -92,46 +156,28 @@ def least_squares(prior_q_mobile_C: float | None = None) -> LeastSquares:
 # over the lives of both cells
 
 
-def fit_whole(discharge: Discharge) -> dict[str, Any]:
-    """Calibrate to one whole discharge."""
-    record = discharge.loaded_part(CUT_OFF_V)
-    estimate = least_squares().estimate(record)
-    row = {name: discharge.meta[name] for name in ("cell", "cycle", "start_time", "capacity_Ah", "Re_ohm", "Rct_ohm")}
-    row |= {
-        "q_mobile_C": estimate.q_mobile,
-        "sd_q_mobile_C": estimate.sd_q_mobile,
-        "r_o_ohm": estimate.r_o,
-        "sd_r_o_ohm": estimate.sd_r_o,
-        "settled": estimate.settled,
-        "duration_s": record.time_s[-1] - record.time_s[0],
-    }
-    for prefix, parameters in (("", estimate), ("new_cell_", _NEW)):
-        forecast = _THERMAL.forecast(record, parameters, CUT_OFF_V)
-        residual_V = forecast.at_samples_V - record.voltage_V
-        row[f"{prefix}voltage_rmse_V"] = float(np.sqrt(np.nanmean(residual_V**2)))
-        row[f"{prefix}eod_error_s"] = forecast.eod_time_s - record.time_s[-1]
-    return row
-
-
 def life_part(cell: str) -> Tables:
     """Whole discharges of a cell, and those in progress without and with the previous one as a prior."""
     whole, in_progress = [], []
     previous_C = None
     for discharge in load_nasa_discharges(cell):
-        whole.append(fit_whole(discharge))
+        record = discharge.loaded_part(CUT_OFF_V)
+        whole.append(
+            {
+                **{name: discharge.meta[name] for name in ("cell", "start_time", "Re_ohm", "Rct_ohm")},
+                **whole_row(discharge, least_squares()),
+                **{f"new_cell_{name}": value for name, value in misses(record, _THERMAL, _NEW).items()},
+            }
+        )
         if previous_C is not None:
             methods = {
                 "least squares alone": least_squares(),
                 "Kalman filter alone": ExtendedKalmanFilter(thermal=True, mismatch_V=UNFITTED_MISMATCH_V),
                 "with prior": least_squares(previous_C),
             }
-            for share in SHARES:
-                for method, calibrator in methods.items():
-                    (found,) = estimates(discharge, calibrator, _THERMAL, [share])
-                    in_progress.append({"cell": cell, "method": method, **found})
+            in_progress += rows_in_progress(discharge, methods, _THERMAL, whole[-1])
         previous_C = whole[-1]["q_mobile_C"]
-    columns = ["cell", "cycle", "share", "method", "q_mobile_C", "sd_q_mobile_C", "settled", "eod_error_percent"]
-    return {"discharges": pd.DataFrame(whole), "in_progress": pd.DataFrame(in_progress, columns=columns)}
+    return {"discharges": pd.DataFrame(whole), "in_progress": pd.DataFrame(in_progress)}
 
 
 def whole_table(whole: pd.DataFrame) -> pd.DataFrame:
@@ -157,26 +203,6 @@ def whole_table(whole: pd.DataFrame) -> pd.DataFrame:
         "and error of EOD, first / last (s)": ("new_cell_eod_error_s", lambda s: f"{s.iloc[0]:+.0f} / {s.iloc[-1]:+.0f}"),
     }
     return table_of(shown, ["cell"], cells)
-
-
-def progress_table(progress: pd.DataFrame, whole: pd.DataFrame) -> pd.DataFrame:
-    """The summary of discharges in progress."""
-    known = progress.merge(whole[["cell", "cycle", "q_mobile_C"]], on=["cell", "cycle"], suffixes=("", "_whole"))
-    known = known.sort_values(["cell", "share", "method"], kind="stable")
-    shown = known.assign(
-        seen=known["share"].map(lambda share: f"{100 * share:.0f}"),
-        error=known["eod_error_percent"].abs(),
-        sd_percent=100 * known["sd_q_mobile_C"] / known["q_mobile_C"],
-        within=(known["q_mobile_C"] - known["q_mobile_C_whole"]).abs() <= 2.0 * known["sd_q_mobile_C"],
-    )
-    cells: dict[str, Cell] = {
-        "mean abs error of EOD (%)": ("error", lambda errors: f"{errors.mean():.1f}"),
-        "worst (%)": ("error", lambda errors: f"{errors.max():.1f}"),
-        "stated sd of q_mobile (%)": ("sd_percent", lambda percent: f"{percent.median():.1f}"),
-        "q_mobile within 2 sd (%)": ("within", share_in_percent),
-        "settled (%)": ("settled", share_in_percent),
-    }
-    return table_of(shown, {"cell": "cell", "seen": "seen (%)", "method": "method"}, cells)
 
 
 def repetition_table(whole: pd.DataFrame) -> pd.DataFrame:
@@ -261,7 +287,7 @@ def real_cells(arguments: Sequence[str]) -> None:
     tables = study.run(life_part, [{"cell": cell} for cell in cells])
     whole, progress = tables["discharges"], tables["in_progress"]
     voltages = plot_voltages({cell: load_nasa_discharges(cell) for cell in cells}, whole)
-    shown = [whole_table(whole), progress_table(progress, whole), repetition_table(whole)]
+    shown = [whole_table(whole), progress_table(progress), repetition_table(whole)]
     text = "\n".join(markdown(table) for table in shown)
     study.write(tables, {"life": plot_life(whole), "voltages": voltages}, text, "summary")
 
@@ -280,51 +306,26 @@ def fitted_to(cell: str) -> CellFit:
     return fit_cell(_three_of(cell), CUT_OFF_V)
 
 
-def fitted_row(discharge: Discharge, calibrator: LeastSquares) -> dict[str, Any]:
-    """Calibrate to one discharge and to its beginnings, in one row."""
-    record = discharge.loaded_part(CUT_OFF_V)
-    whole, *beginnings = estimates(discharge, calibrator, calibrator.model, (1.0, *SHARES))
-    residual_V = calibrator.model.voltage(record, calibrator.estimate(record)) - record.voltage_V
-    row = {name: whole[name] for name in ("cycle", "capacity_Ah", "q_mobile_C", "r_o_ohm")}
-    row |= {"voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))), "settled": whole["settled"]}
-    for found in beginnings:
-        percent = f"at_{100 * found['share']:.0f}_percent"
-        row[f"eod_error_percent_{percent}"] = found["eod_error_percent"]
-        row[f"within_2_sd_{percent}"] = abs(found["q_mobile_C"] - whole["q_mobile_C"]) <= 2.0 * found["sd_q_mobile_C"]
-        row[f"settled_{percent}"] = found["settled"]
-    return row
-
-
 def fit_part(trained: str, tested: str, every: int) -> Tables:
     """Fit one cell, and test the constants on the other."""
     fit = fitted_to(trained)
-    calibrators = {"of the new cell": least_squares(), f"fitted to {trained}": fit.calibrator()}
-    rows = [
-        {"cell": tested, "constants": constants, **fitted_row(discharge, calibrator)}
-        for discharge in load_nasa_discharges(tested)[::every]
-        for constants, calibrator in calibrators.items()
-    ]
+    whole, in_progress = [], []
+    for discharge in load_nasa_discharges(tested)[::every]:
+        for constants, calibrator in {"of the new cell": least_squares(), f"fitted to {trained}": fit.calibrator()}.items():
+            whole.append({"cell": tested, "constants": constants, **whole_row(discharge, calibrator)})
+            in_progress += rows_in_progress(discharge, {constants: calibrator}, calibrator.model, whole[-1])
     constants = pd.DataFrame(fit.constants).assign(identified=[each.identified for each in fit.constants], fitted_to=trained)
-    return {"discharges": pd.DataFrame(rows), "constants": constants}
+    return {"discharges": pd.DataFrame(whole), "in_progress": pd.DataFrame(in_progress), "constants": constants}
 
 
-def fit_table(scores: pd.DataFrame) -> pd.DataFrame:
-    """The table for readers."""
-
-    def errors_of(error_percent: pd.Series) -> str:
-        return f"{error_percent.abs().mean():.1f} / {error_percent.abs().max():.0f}"
-
-    def rmse_of(rmse_V: pd.Series) -> str:
-        return f"{1e3 * rmse_V.median():.0f} / {1e3 * rmse_V.max():.0f}"
-
-    cells: dict[str, Cell] = {"voltage RMSE, median / max (mV)": ("voltage_rmse_V", rmse_of)}
-    for percent in (f"{100 * share:.0f}" for share in SHARES):
-        cells[f"EOD at {percent} %: mean / worst error (%)"] = (f"eod_error_percent_at_{percent}_percent", errors_of)
-        cells[f"settled at {percent} % (%)"] = (f"settled_at_{percent}_percent", share_in_percent)
-        cells[f"q within 2 sd at {percent} % (%)"] = (f"within_2_sd_at_{percent}_percent", share_in_percent)
-    cells["whole: settled (%)"] = ("settled", share_in_percent)
-    cells["corr(q_mobile, capacity)"] = lambda part: f"{part['q_mobile_C'].corr(part['capacity_Ah']):.4f}"
-    return table_of(scores, {"cell": "tested on", "constants": "constants"}, cells)
+def fit_table(whole: pd.DataFrame) -> pd.DataFrame:
+    """The summary of whole discharges."""
+    cells: dict[str, Cell] = {
+        "voltage RMSE, median / max (mV)": ("voltage_rmse_V", lambda V: f"{1e3 * V.median():.0f} / {1e3 * V.max():.0f}"),
+        "settled (%)": ("settled", share_in_percent),
+        "corr(q_mobile, capacity)": lambda part: f"{part['q_mobile_C'].corr(part['capacity_Ah']):.4f}",
+    }
+    return table_of(whole, {"cell": "tested on", "constants": "constants"}, cells)
 
 
 def fit_of_another(arguments: Sequence[str]) -> None:
@@ -334,7 +335,8 @@ def fit_of_another(arguments: Sequence[str]) -> None:
     study = _study(parser, arguments, fitted_to="first, middle and last discharge of the other cell")
     pairs = [{"trained": trained, "tested": tested, "every": study.chosen.every} for trained, tested in PAIRS]
     tables = study.run(fit_part, pairs)
-    text, figures = [markdown(fit_table(tables["discharges"]))], dict[str, Figure]()
+    text = [markdown(fit_table(tables["discharges"])), markdown(progress_table(tables["in_progress"]))]
+    figures = dict[str, Figure]()
     for trained, tested in PAIRS:
         fit = fitted_to(trained)  # seconds: once more, for what is no table
         text.append(f"Fitted to {trained}:\n\n```\n{fit.summary()}\n```\n")
