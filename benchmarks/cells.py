@@ -62,27 +62,21 @@ def whole_row(discharge: Discharge, calibrator: LeastSquares) -> dict[str, Any]:
     """Calibrate to one whole discharge."""
     record = discharge.loaded_part(CUT_OFF_V)
     estimate = calibrator.estimate(record)
-    return {
-        "cycle": discharge.meta["cycle"],
-        "capacity_Ah": discharge.meta["capacity_Ah"],
+    row = {name: discharge.meta[name] for name in ("cell", "cycle", "start_time", "capacity_Ah", "Re_ohm", "Rct_ohm")}
+    row |= {
         "q_mobile_C": estimate.q_mobile,
         "sd_q_mobile_C": estimate.sd_q_mobile,
         "r_o_ohm": estimate.r_o,
         "sd_r_o_ohm": estimate.sd_r_o,
         "settled": estimate.settled,
         "duration_s": record.time_s[-1] - record.time_s[0],
-        **misses(record, calibrator.model, estimate),
     }
-
-
-def misses(record: Discharge, model: RecordModel, parameters: Estimate) -> dict[str, float]:
-    """What a model misses of the voltage, and of the end, of a whole discharge."""
-    forecast = model.forecast(record, parameters, CUT_OFF_V)
-    residual_V = forecast.at_samples_V - record.voltage_V
-    return {
-        "voltage_rmse_V": float(np.sqrt(np.nanmean(residual_V**2))),
-        "eod_error_s": forecast.eod_time_s - record.time_s[-1],
-    }
+    for prefix, model, parameters in (("", calibrator.model, estimate), ("new_cell_", _THERMAL, _NEW)):
+        forecast = model.forecast(record, parameters, CUT_OFF_V)
+        residual_V = forecast.at_samples_V - record.voltage_V
+        row[f"{prefix}voltage_rmse_V"] = float(np.sqrt(np.nanmean(residual_V**2)))
+        row[f"{prefix}eod_error_s"] = forecast.eod_time_s - record.time_s[-1]
+    return row
 
 
 def rows_in_progress(
@@ -161,14 +155,7 @@ def life_part(cell: str) -> Tables:
     whole, in_progress = [], []
     previous_C = None
     for discharge in load_nasa_discharges(cell):
-        record = discharge.loaded_part(CUT_OFF_V)
-        whole.append(
-            {
-                **{name: discharge.meta[name] for name in ("cell", "start_time", "Re_ohm", "Rct_ohm")},
-                **whole_row(discharge, least_squares()),
-                **{f"new_cell_{name}": value for name, value in misses(record, _THERMAL, _NEW).items()},
-            }
-        )
+        whole.append(whole_row(discharge, least_squares()))
         if previous_C is not None:
             methods = {
                 "least squares alone": least_squares(),
@@ -180,7 +167,7 @@ def life_part(cell: str) -> Tables:
     return {"discharges": pd.DataFrame(whole), "in_progress": pd.DataFrame(in_progress)}
 
 
-def whole_table(whole: pd.DataFrame) -> pd.DataFrame:
+def whole_table(whole: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """The summary of whole discharges."""
     shown = whole.assign(
         error_s=whole["eod_error_s"].abs(),
@@ -202,7 +189,7 @@ def whole_table(whole: pd.DataFrame) -> pd.DataFrame:
         "new cell's parameters: RMSE, median (mV)": ("new_cell_voltage_rmse_V", lambda V: f"{1e3 * V.median():.0f}"),
         "and error of EOD, first / last (s)": ("new_cell_eod_error_s", lambda s: f"{s.iloc[0]:+.0f} / {s.iloc[-1]:+.0f}"),
     }
-    return table_of(shown, ["cell"], cells)
+    return table_of(shown, by, cells)
 
 
 def repetition_table(whole: pd.DataFrame) -> pd.DataFrame:
@@ -287,7 +274,7 @@ def real_cells(arguments: Sequence[str]) -> None:
     tables = study.run(life_part, [{"cell": cell} for cell in cells])
     whole, progress = tables["discharges"], tables["in_progress"]
     voltages = plot_voltages({cell: load_nasa_discharges(cell) for cell in cells}, whole)
-    shown = [whole_table(whole), progress_table(progress), repetition_table(whole)]
+    shown = [whole_table(whole, ["cell"]), progress_table(progress), repetition_table(whole)]
     text = "\n".join(markdown(table) for table in shown)
     study.write(tables, {"life": plot_life(whole), "voltages": voltages}, text, "summary")
 
@@ -311,21 +298,11 @@ def fit_part(trained: str, tested: str, every: int) -> Tables:
     fit = fitted_to(trained)
     whole, in_progress = [], []
     for discharge in load_nasa_discharges(tested)[::every]:
-        for constants, calibrator in {"of the new cell": least_squares(), f"fitted to {trained}": fit.calibrator()}.items():
-            whole.append({"cell": tested, "constants": constants, **whole_row(discharge, calibrator)})
-            in_progress += rows_in_progress(discharge, {constants: calibrator}, calibrator.model, whole[-1])
+        for method, calibrator in {"of the new cell": least_squares(), f"fitted to {trained}": fit.calibrator()}.items():
+            whole.append({"method": method, **whole_row(discharge, calibrator)})
+            in_progress += rows_in_progress(discharge, {method: calibrator}, calibrator.model, whole[-1])
     constants = pd.DataFrame(fit.constants).assign(identified=[each.identified for each in fit.constants], fitted_to=trained)
     return {"discharges": pd.DataFrame(whole), "in_progress": pd.DataFrame(in_progress), "constants": constants}
-
-
-def fit_table(whole: pd.DataFrame) -> pd.DataFrame:
-    """The summary of whole discharges."""
-    cells: dict[str, Cell] = {
-        "voltage RMSE, median / max (mV)": ("voltage_rmse_V", lambda V: f"{1e3 * V.median():.0f} / {1e3 * V.max():.0f}"),
-        "settled (%)": ("settled", share_in_percent),
-        "corr(q_mobile, capacity)": lambda part: f"{part['q_mobile_C'].corr(part['capacity_Ah']):.4f}",
-    }
-    return table_of(whole, {"cell": "tested on", "constants": "constants"}, cells)
 
 
 def fit_of_another(arguments: Sequence[str]) -> None:
@@ -335,8 +312,8 @@ def fit_of_another(arguments: Sequence[str]) -> None:
     study = _study(parser, arguments, fitted_to="first, middle and last discharge of the other cell")
     pairs = [{"trained": trained, "tested": tested, "every": study.chosen.every} for trained, tested in PAIRS]
     tables = study.run(fit_part, pairs)
-    text = [markdown(fit_table(tables["discharges"])), markdown(progress_table(tables["in_progress"]))]
-    figures = dict[str, Figure]()
+    tests = [whole_table(tables["discharges"], ["cell", "method"]), progress_table(tables["in_progress"])]
+    text, figures = [markdown(table) for table in tests], dict[str, Figure]()
     for trained, tested in PAIRS:
         fit = fitted_to(trained)  # seconds: once more, for what is no table
         text.append(f"Fitted to {trained}:\n\n```\n{fit.summary()}\n```\n")

@@ -59,7 +59,7 @@ ALGORITHMS: dict[str, tuple[str, str, dict[str, Any] | None]] = {
     "tqc": ("TQC", "sb3_contrib:TQC", {}),
 }
 OURS = ("lac", "lac_fourth_root", "lac_zoo")
-RIVALS = ("sac", "td3", "tqc")
+RIVALS = ("published_lac", "sac", "td3", "tqc")
 _CAR = {
     "learning_rate": 3e-4,
     "buffer_size": 50_000,
