@@ -10,8 +10,9 @@ electrolyte), looked at as a lab does with its own.
 A cell is worn from discharge to discharge: it loses active material on both sides, and its contacts get worse. Every fourth
 discharge has a current that changes each minute, the others a constant one. Constants are fitted to three discharges at a
 constant current and two at a varying one, over the life. Of each other discharge the first 25, 50 and 75 % of the time are
-seen: when will it end, by the fit alone, and by the six discharges before as well? That an end keeps to what a cell holds over
-its life was found on these cells; no number was chosen on them.
+seen: when will it end, by the fit alone, and by the six discharges before as well? And how far is q_max of whole discharges
+in other surroundings than those of the fit from that of the same cell there? That an end keeps to what a cell holds over its
+life was found on these cells; no number was chosen on them.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from matplotlib.figure import Figure
 
 from battery_env import Discharge, Settings, calibrate, fit_cell, track_life
 from battery_env.arrays import FloatArray
+from battery_env.checks import ZERO_CELSIUS_K
+from battery_env.lab.report import Calibration
 from battery_env.lab.running import forecast_end
 from battery_env.loads import Load
 from battery_env.plotting import coloured
@@ -58,6 +61,8 @@ FIT, LIFE = "the fit", "the fit and six discharges before"
 RATE, RATES, MINUTE_S = 0.8, (0.3, 1.3), 60.0
 #: What a life takes of the active material of the negative and the positive electrode, and how many times larger contacts get.
 LOST, CONTACT, CONTACT_GROWTH = (0.15, 0.10), 0.025, 3.0
+#: Of the surroundings, degC: those of the life, and others, with the discharge that is looked at in each.
+OF_LIFE_C, OTHERS_C, MOVED = 25.0, (5.0, 15.0, 35.0, 45.0), 12
 #: Sampling, s, and noise: V, and a share of the capacity over an hour.
 SAMPLING_S, NOISE_V, NOISE_A = 10.0, 0.001, 2e-4
 
@@ -74,8 +79,10 @@ def varies(n: int) -> bool:
     return n % 4 == 3
 
 
-def simulated(name: str, seed: int) -> SimulatedLife:
-    """The life of a cell."""
+def simulated(
+    name: str, seed: int, numbers: Sequence[int] = range(DISCHARGES), surroundings_C: float = OF_LIFE_C
+) -> SimulatedLife:
+    """The life of a cell, or some of its discharges."""
     import pybamm  # here, as it is no requirement of the tests
 
     pybamm.set_logging_level("ERROR")
@@ -83,10 +90,11 @@ def simulated(name: str, seed: int) -> SimulatedLife:
     capacity_Ah, cut_off_V = float(new["Nominal cell capacity [A.h]"]), float(new["Lower voltage cut-off [V]"])
     is_thermal = "Negative current collector thickness [m]" in new
     options = {"contact resistance": "true", "thermal": "lumped" if is_thermal else "isothermal"}
-    for n in range(DISCHARGES):
+    for n in numbers:
         worn, age = new.copy(), n / (DISCHARGES - 1)
         for side, lost in zip(("Negative", "Positive"), LOST, strict=True):
             worn[f"{side} electrode active material volume fraction"] *= 1.0 - lost * age
+        worn["Ambient temperature [K]"] = worn["Initial temperature [K]"] = surroundings_C + ZERO_CELSIUS_K
         worn["Contact resistance [Ohm]"] = CONTACT / capacity_Ah * (1.0 + CONTACT_GROWTH * age)
         if varies(n):
             starts_s = np.arange(0.0, 400.0 * MINUTE_S, SAMPLING_S)
@@ -100,12 +108,13 @@ def simulated(name: str, seed: int) -> SimulatedLife:
         steps = [rest, pybamm.step.current(drive, termination=ends, period=often), rest]
         model = pybamm.lithium_ion.SPMe(options)
         solution = pybamm.Simulation(model, parameter_values=worn, experiment=pybamm.Experiment(steps)).solve(initial_soc=1.0)
-        columns = [np.asarray(solution[each].entries) for each in ("Time [s]", "Terminal voltage [V]", "Current [A]")]
+        names = ("Time [s]", "Terminal voltage [V]", "Current [A]", "Volume-averaged cell temperature [C]")
+        columns = np.array([solution[name].entries for name in names])
         # a step begins when the one before ends
-        time_s, voltage_V, current_A = np.array(columns)[:, np.append(True, np.diff(columns[0]) > 1e-6)]
+        time_s, voltage_V, current_A, temperature_C = columns[:, np.append(True, np.diff(columns[0]) > 1e-6)]
         voltage_V = voltage_V + rng.normal(0.0, NOISE_V, len(time_s))
         current_A = current_A + rng.normal(0.0, NOISE_A * capacity_Ah, len(time_s)) * (current_A > 0.0)
-        made.append(Discharge(time_s, voltage_V, current_A))
+        made.append(Discharge(time_s, voltage_V, current_A, temperature_C))
     return SimulatedLife(made, cut_off_V)
 
 
@@ -135,7 +144,23 @@ def part(cell: str, seed: int) -> Tables:
             for knows, own in ((FIT, None), (LIFE, before)):
                 quantiles_s = forecast_end(seen, settings, load, life=own).eod_quantile_s()
                 rows.append({**common, "knows": knows, "share": share, **_end(quantiles_s, start_s, end_s)})
-    return {"pybamm_cells": pd.DataFrame(rows)}
+    there, surroundings = calibrate(life[MOVED], settings), []
+    for other_C in OTHERS_C:
+        (moved,) = simulated(cell, seed, [MOVED], other_C).discharges
+        surroundings.append(
+            {"cell": cell, "seed": seed, "surroundings_C": other_C, **_moved(there, calibrate(moved, settings))}
+        )
+    return {"pybamm_cells": pd.DataFrame(rows), "surroundings": pd.DataFrame(surroundings)}
+
+
+def _moved(there: Calibration, elsewhere: Calibration) -> dict[str, float]:
+    change_C = elsewhere.q_mobile_C - there.q_mobile_C
+    return {
+        "q_mobile_percent": 100.0 * change_C / there.q_mobile_C,
+        "q_mobile_sd": change_C / elsewhere.sd_q_mobile_C,
+        "r_o_ratio": elsewhere.r_o_ohm / there.r_o_ohm,
+        "settled_q_mobile": elsewhere.settled_q_mobile,
+    }
 
 
 def _end(quantiles_s: FloatArray, start_s: float, end_s: float) -> dict[str, float]:
@@ -163,6 +188,21 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     return table_of(shown, ["cell", "knows"], cells)
 
 
+def surroundings_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """One line a cell: whole discharges in other surroundings, with constants that were fitted in those of the life."""
+
+    def by_surroundings(column: str) -> Cell:
+        return lambda group: side_by_side(group.groupby("surroundings_C")[column].mean())
+
+    cells: dict[str, Cell] = {
+        f"q_mobile at {side_by_side(OTHERS_C)} degC: off (%)": by_surroundings("q_mobile_percent"),
+        "in standard deviations": by_surroundings("q_mobile_sd"),
+        "r_o over that of the life": by_surroundings("r_o_ratio"),
+        "settled q_mobile (%)": ("settled_q_mobile", share_in_percent),
+    }
+    return table_of(rows.assign(cell=rows["cell"].map(CELLS)), ["cell"], cells)
+
+
 def plot(rows: pd.DataFrame) -> Figure:
     """The error of the end and its interval after half of the time, over the life of each cell."""
     half = rows[rows["share"] == 0.5]
@@ -187,7 +227,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = study.chosen
     tables = study.run(part, [{"cell": cell, "seed": seed} for cell in chosen.cells for seed in chosen.seeds])
     rows = tables["pybamm_cells"]
-    study.write(tables, {"pybamm_cells": plot(rows[rows["seed"] == chosen.seeds[0]])}, markdown(summary(rows)))
+    text = "\n".join(markdown(table) for table in (summary(rows), surroundings_table(tables["surroundings"])))
+    study.write(tables, {"pybamm_cells": plot(rows[rows["seed"] == chosen.seeds[0]])}, text)
 
 
 if __name__ == "__main__":

@@ -125,13 +125,14 @@ def forecast_end(
     :param settings: how to look at it; ``None``: the defaults
     :param load: from the last sample under load on, as :func:`battery_env.forecast` takes it; ``None``: as so far
     :param samples: of what may come
-    :param life: of the cell before, whose prior is taken that suits the load; ``None``: that of the settings, if any
+    :param life: of the cell before, whose prior is taken that suits the load; ``None``: that of the settings, if any. With a
+        prior the constants are held, as over a life: they and ``r_o`` carry over to other loads together
     :raises ValueError: if the discharge cannot be used, or a load cannot be meant
     """
     settings = Settings() if settings is None else settings
     if life is not None:
-        settings = _with_prior(settings, life.prior_for(discharge, load))
-    end = calibrated(discharge, settings, load, samples, end_is_asked=True).end
+        settings = replace(settings, prior_q_mobile_C=life.prior_for(discharge, load))
+    end = calibrated(discharge, _carried_over(settings), load, samples, end_is_asked=True).end
     assert end is not None
     return end
 
@@ -206,9 +207,9 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
     return before
 
 
-def _with_prior(settings: Settings, prior_q_mobile_C: tuple[float, float]) -> Settings:
-    """What a life tells of ``q_mobile``, with the constants by which it was tracked."""
-    return replace(settings, prior_q_mobile_C=prior_q_mobile_C, cell_rates_sd={})
+def _carried_over(settings: Settings) -> Settings:
+    """With the constants held by which a prior of ``q_mobile`` was found, if there is one."""
+    return settings if settings.prior_q_mobile_C is None else replace(settings, cell_rates_sd={})
 
 
 def end_of_record(
@@ -231,8 +232,8 @@ def end_of_record(
         if len(named) > 1:
             raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")
         past = life_before(before, settings)
-        settings = _with_prior(settings, past.prior_for(running, to_come))
-    found = calibrated(running, settings, to_come, end_is_asked=True)
+        settings = replace(settings, prior_q_mobile_C=past.prior_for(running, to_come))
+    found = calibrated(running, _carried_over(settings), to_come, end_is_asked=True)
     if not found.in_progress:
         raise ValueError(
             f"{argument} reaches {settings.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "

@@ -222,7 +222,7 @@ class Settings:
     def _rates_sd(self) -> Mapping[str, float]:
         """
         How well the rate constants are known, that are searched for beside both parameters: all that least squares are not
-        told. A path tells them, and a prior that is stated alone is for the constants as they are.
+        told. A path tells them.
         """
         if self.path is not None:
             return {}
@@ -230,6 +230,4 @@ class Settings:
             return self.cell_rates_sd
         if self.fit is not None:
             return self.fit.rates_sd
-        if self.prior_q_mobile_C is not None:
-            return {}
         return RATE_PRIOR_SD if self.cell is None else dict.fromkeys(RATE_PRIOR_SD, SAME_KIND_SD)
