@@ -125,14 +125,12 @@ def forecast_end(
     :param settings: how to look at it; ``None``: the defaults
     :param load: from the last sample under load on, as :func:`battery_env.forecast` takes it; ``None``: as so far
     :param samples: of what may come
-    :param life: of the cell before, whose prior is taken that suits the load; ``None``: that of the settings, if any. With a
-        prior the constants are held, as over a life: they and ``r_o`` carry over to other loads together
+    :param life: of the cell before, whose prior is taken that suits the load; ``None``: that of the settings, if any.
+        Constants are held along with a life, or with a prior and a load: they and ``r_o`` carry over together
     :raises ValueError: if the discharge cannot be used, or a load cannot be meant
     """
     settings = Settings() if settings is None else settings
-    if life is not None:
-        settings = replace(settings, prior_q_mobile_C=life.prior_for(discharge, load))
-    end = calibrated(discharge, _carried_over(settings), load, samples, end_is_asked=True).end
+    end = calibrated(discharge, _known_before(discharge, settings, load, life), load, samples, end_is_asked=True).end
     assert end is not None
     return end
 
@@ -207,9 +205,12 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
     return before
 
 
-def _carried_over(settings: Settings) -> Settings:
-    """With the constants held by which a prior of ``q_mobile`` was found, if there is one."""
-    return settings if settings.prior_q_mobile_C is None else replace(settings, cell_rates_sd={})
+def _known_before(running: Discharge, settings: Settings, load: LoadToCome | None, life: Life | None) -> Settings:
+    """With the prior of a life. Along with one that comes from a life, or goes to another load, constants are held."""
+    if life is not None:
+        settings = replace(settings, prior_q_mobile_C=life.prior_for(running, load))
+    is_held = settings.prior_q_mobile_C is not None and (life is not None or load is not None)
+    return replace(settings, cell_rates_sd={}) if is_held else settings
 
 
 def end_of_record(
@@ -232,8 +233,7 @@ def end_of_record(
         if len(named) > 1:
             raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")
         past = life_before(before, settings)
-        settings = replace(settings, prior_q_mobile_C=past.prior_for(running, to_come))
-    found = calibrated(running, _carried_over(settings), to_come, end_is_asked=True)
+    found = calibrated(running, _known_before(running, settings, to_come, past), to_come, end_is_asked=True)
     if not found.in_progress:
         raise ValueError(
             f"{argument} reaches {settings.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "

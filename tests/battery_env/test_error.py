@@ -25,11 +25,13 @@ def test_whitened_errors_are_those_of_the_whole_covariance(load):
 
 @pytest.mark.parametrize("slower", sweep(3.0, 0.5, 2.0))
 @pytest.mark.parametrize("kinetics", sweep(0.3, 1.0))
-def test_slow_diffusion_of_a_worn_cell_is_taken_for_neither_charge_nor_resistance(slower, kinetics):
+@pytest.mark.parametrize("prior_C", [None, (5500.0, 55.0)])
+def test_slow_diffusion_of_a_worn_cell_is_taken_for_neither_charge_nor_resistance(slower, kinetics, prior_C):
     cell = NEW_CELL.replace(tDiffusion=slower * NEW_CELL.tDiffusion, kn=kinetics * NEW_CELL.kn)
     worn = simulate(2.0, 5500.0, 0.13, load_unit="current", thermal=True, cell=cell, cut_off_V=2.7)
     record = Discharge(worn.time_s[::10], worn.voltage_V[::10], worn.current_A[::10])
-    found = Settings().calibrator().estimate(record)
+    found = Settings(prior_q_mobile_C=prior_C).calibrator().estimate(record)
+    assert "contradicts" not in found.reason
     assert abs(found.q_mobile - 5500.0) < 3.0 * found.sd_q_mobile and abs(found.r_o - 0.13) < 3.0 * found.sd_r_o
 
 

@@ -444,7 +444,8 @@ class TestCommand:
         assert [note for note in paused if note not in plain] == [
             f"What was recorded after the last sample under load, at {table['time_s'].iloc[-1]:.0f} s, is left out."
         ]
-        sure = terminal.row("forecast", "running.csv", *known, "--mismatch", "0.01", status=3)["notes"]
+        held = ("--load", "profile.csv", "--mismatch", "0.01")
+        sure = terminal.row("forecast", "running.csv", *known, *held, status=3)["notes"]
         assert any("more than mismatch_V" in note for note in sure) and not any("mismatch_V." in note for note in plain)
 
     def test_a_record_that_contradicts_its_estimate_has_its_own_status(self, terminal):
