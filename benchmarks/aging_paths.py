@@ -266,9 +266,8 @@ def _least_squares(settings: Settings) -> LeastSquares:
 
 def _with_own_life(method: str, settings: Settings, before: Life, whole: _Whole) -> Iterator[dict[str, object]]:
     """What is said of a discharge in progress by those who know the life of its cell so far."""
-    known = replace(settings, prior_q_mobile_C=before.prior_q_mobile_C)
     for share in SHARES[:-1]:
-        ahead = forecast_end(whole.seen(share), known)
+        ahead = forecast_end(whole.seen(share), settings, life=before)
         yield {"method": method, "share": share, **_end(whole, ahead.eod_quantile_s(BAND))}
 
 
