@@ -272,7 +272,7 @@ class LeastSquares(Estimator):
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance) / sd_C)
-            fit = search.best([*starts, alone.values, *search.starts([mean_C])[0]], [*priors, carried])
+            fit = search.best([alone.values, *search.starts([mean_C])[0]], [*priors, carried])
             fit = replace(fit, spread=search.spread(fit, [*priors, carried], variance))
         evidence = self._evidence(record, history, fit)
         return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, unseen_C(evidence)), evidence)
