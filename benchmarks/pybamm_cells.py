@@ -61,8 +61,11 @@ FIT, LIFE = "the fit", "the fit and six discharges before"
 RATE, RATES, MINUTE_S = 0.8, (0.3, 1.3), 60.0
 #: What a life takes of the active material of the negative and the positive electrode, and how many times larger contacts get.
 LOST, CONTACT, CONTACT_GROWTH = (0.15, 0.10), 0.025, 3.0
-#: Of the surroundings, degC: those of the life, and others, with the discharge that is looked at in each.
-OF_LIFE_C, OTHERS_C, MOVED = 25.0, (5.0, 15.0, 35.0, 45.0), 12
+#: Of the surroundings of a life, degC.
+OF_LIFE_C = 25.0
+#: Of others, degC, and which discharge is looked at in each.
+OTHERS_C = (5.0, 15.0, 35.0, 45.0)
+MOVED = 12
 #: Sampling, s, and noise: V, and a share of the capacity over an hour.
 SAMPLING_S, NOISE_V, NOISE_A = 10.0, 0.001, 2e-4
 

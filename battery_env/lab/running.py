@@ -206,11 +206,11 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
 
 
 def _known_before(running: Discharge, settings: Settings, load: LoadToCome | None, life: Life | None) -> Settings:
-    """With the prior of a life. Along with one that comes from a life, or goes to another load, constants are held."""
+    """With the prior of a life. Constants of unstated doubt are held where they carry over: from a life, to another load."""
     if life is not None:
         settings = replace(settings, prior_q_mobile_C=life.prior_for(running, load))
     is_held = settings.prior_q_mobile_C is not None and (life is not None or load is not None)
-    return replace(settings, cell_rates_sd={}) if is_held else settings
+    return replace(settings, cell_rates_sd=settings.cell_rates_sd or {}) if is_held else settings
 
 
 def end_of_record(
