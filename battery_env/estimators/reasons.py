@@ -85,6 +85,10 @@ class Doubt(_Row):
         "on. Correct the times if the clock jumped, or give a rest as samples of no current."
     )
     CONSTANTS = "the discharges that the constants were fitted to leave it open. Fit such of other loads, or with pauses, too."
+    KNEE = (
+        "where the record ends, its voltage falls less steeply than that of the model. The knee of this cell may come later. "
+        "Discharge further, or fit constants to this cell (fit_cell, --cell)."
+    )
     POLICY = "the policy is so far from the fit in its observation, which it does not trust. Use least squares."
 
 

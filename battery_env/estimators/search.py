@@ -155,6 +155,7 @@ class Fit:
     square: float  # of all residuals as they are weighed
     at_bound: tuple[str, ...]  # which parameters are
     spread: float = 1.0  # how many times as wide as its curvature says the likelihood of q_mobile is
+    knee_sd_C: float = 0.0  # of the charge that the record may give beyond the knee of its model
 
 
 @dataclass(frozen=True)
