@@ -119,7 +119,7 @@ def test_only_reports_know_the_other_files_of_stability():
 
 
 # names of modules that differ from those of the distributions that bring them
-DISTRIBUTIONS = {"sb3_contrib": "sb3_contrib", "sbx": "sbx-rl", "yaml": "rl_zoo3", "optuna": "rl_zoo3"}
+DISTRIBUTIONS = {"sb3_contrib": "sb3_contrib", "sbx": "sbx-rl", "yaml": "rl_zoo3", "optuna": "rl_zoo3", "PIL": "matplotlib"}
 OWN = {"battery_env", "sb3_lac", "benchmarks", "checks", "tests", "examples", "docs"}
 #: The distributions and extras that bring what a folder imports.
 DECLARED = {

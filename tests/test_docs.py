@@ -4,12 +4,14 @@ import re
 import shlex
 
 import pytest
+from PIL import Image
 
 from battery_env.__main__ import calibrate
 from battery_env.estimators.reasons import Doubt, Reason
 from battery_env.parameters import PARAMETER_NAMES
 from checks.pages import DOCS, PAGES, ROOT, blocks, docstring_examples
 from sb3_lac.stability import fitting
+from tests.sweeps import sweep
 
 # What an example needs that no installation for the tests has: it is skipped there.
 OPTIONAL = {"compare_with_pybop.py": ("pybop",)}
@@ -113,9 +115,40 @@ def test_reasons_can_be_looked_up_by_their_own_words():
     assert named and not [words for words in named if not any(words in text for text in texts)]
 
 
-def test_the_first_screen_names_the_interval_that_the_tutorial_of_a_life_shows():
-    (shown,) = re.findall(r"end of discharge \(s\) +(\d+) +\d+ +(\d+)", (DOCS / "cell_life.md").read_text(encoding="utf-8"))
-    assert f"lies within {shown[0]} to {shown[1]} s" in (ROOT / "README.md").read_text(encoding="utf-8")
+def test_the_first_screen_names_the_interval_that_its_block_prints(capsys):
+    page = ROOT / "README.md"
+    (block,) = (block for block in blocks(page, "python") if "track_life" in block)
+    exec(compile(block, str(page), "exec"), {})
+    (shown,) = re.findall(r"end of discharge \(s\) +(\d+) +\d+ +(\d+)", capsys.readouterr().out)
+    assert f"lies within {shown[0]} to {shown[1]} s" in page.read_text(encoding="utf-8")
+
+
+#: Figures with numbers in their titles: the page that shows each, and what the command of the page writes.
+FIGURES = sweep(
+    ("first_discharge.png", "first_discharge.md", "results/B0005_100_voltage.png"),
+    ("own_cell.png", "own_cell.md", "my_cell_fit.png"),
+)
+
+
+def title_of(path):
+    with Image.open(path) as picture:
+        return picture.text["Title"]
+
+
+@pytest.mark.parametrize(("figure", "page", "written"), FIGURES)
+def test_the_titles_of_a_figure_are_those_that_the_command_of_its_page_writes(figure, page, written, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = next(block for block in blocks(DOCS / page, "bash") if "battery-calibrate" in block).splitlines()[0]
+    calibrate(shlex.split(command, comments=True)[1:])
+    assert title_of(DOCS / "pictures" / figure) == title_of(written)
+
+
+@pytest.mark.attacks
+def test_runs_of_another_page_do_not_disturb_the_comparison_of_runs(tmp_path, monkeypatch):
+    for name in ("judge_any_loop.md", "tensorboard.md"):
+        for source in examples(DOCS / name):
+            run_briefly(source, name, tmp_path, monkeypatch)
+    assert {path.name for path in (tmp_path / "bands").iterdir()} == {"LAC", "PublishedLAC", "SAC", "TD3"}
 
 
 def tried_of_docstrings():
