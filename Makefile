@@ -6,7 +6,7 @@ TORCH ?= torch==2.13.0
 TORCH_INDEX ?=
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := sb3_lac battery_env benchmarks tests examples docs
+SOURCES := sb3_lac battery_env benchmarks checks tests examples docs
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-attacks test-browser test-oldest format lint type-check docs commit-checks clean
@@ -39,7 +39,7 @@ install: $(VENV)/.installed  ## make .venv with everything in it
 demo: install  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some minutes; figures in results/
 	$(BIN)/python -m benchmarks.demo
 
-test: install  ## all tests but attacks
+test: install  ## all tests of the product but attacks
 	$(BIN)/python -m pytest -n 2 --dist worksteal  # neighbours share their fixtures, and no worker is idle in the end
 
 test-attacks: install  ## attacks: sweeps over faults, their sizes and places, studies, and what trains long
@@ -61,9 +61,10 @@ format: install  ## black, and what ruff can mend
 	$(BIN)/python -m ruff check --fix $(SOURCES)
 	$(BIN)/python -m black --quiet $(SOURCES)
 
-lint: install  ## what ruff and black find
+lint: install  ## what ruff, black and the rules of checks/ find: of code, sizes, pages, the reference and published tables
 	$(BIN)/python -m ruff check $(SOURCES)
 	$(BIN)/python -m black --check --quiet $(SOURCES)
+	$(BIN)/python -m pytest -q checks
 
 type-check: install  ## mypy
 	$(BIN)/python -m mypy
