@@ -96,6 +96,7 @@ READ = {
     "words in a row": (at(50, time="Step", voltage="three", current=""), "no measurement of a cell in row 51 (1 in all)"),
     "no cell at the ends": (pd.concat([DEAD, TABLE], ignore_index=True), "no measurement of a cell in row 1 to 2 (2 in all)"),
     "a time of day": (named(time=TIMES_OF_DAY), "the time of day 'time' passes midnight: a day more from row 65 on"),
+    "a time of day with decimal commas": (named(time=TIMES_OF_DAY.str.replace(".", ",")), "passes midnight"),
     "a time of day that is a number": (named(time=(RECORD.time_s + 85800.0) % 86400.0), "passes midnight"),
     "a time of day, of a cycle each": (named(time=TIMES_OF_DAY, Cycle=1 + (RECORD.time_s > 600.0)), "passes midnight"),
     **{

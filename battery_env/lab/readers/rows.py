@@ -129,12 +129,12 @@ def seconds(values: pd.Series, column: Column) -> FloatArray:
         return found * 10.0 ** (10 - digits) if digits in (13, 16, 19) else found
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a day that is no month
+        text = text.str.replace(r",(?=\d+$)", ".", regex=True)
         readings: list[pd.Series] = [pd.to_timedelta(text, errors="coerce")]
         if (readings[0] >= pd.Timedelta(0)).sum() < text.notna().sum():
             # days and dates stand before a clock as in 1-02:03:04, 1 day, 2:03:04, and 2026-02-27,22:50:00
             text = text.str.replace(r"(?<=\d)[^\d:]+(?=\d+:)", " ", n=1, regex=True)
             text = text.str.replace(r"^(\d+) (?=\d+:)", r"\1 days ", regex=True)
-            text = text.str.replace(r"(?<=\d),(?=\d)", ".", regex=True)
             readings = [pd.to_timedelta(text, errors="coerce")]
         if readings[0].isna().mean() > 0.5:
             # UTC, as the clocks of a time zone are put forward and back
@@ -251,8 +251,8 @@ def changes(rows: pd.DataFrame, name: str) -> BoolArray:
 
 def in_order(rows: pd.DataFrame) -> pd.DataFrame:
     """
-    Of two rows at one time the second is later where the step changes or the load is switched; others are left out, if they are
-    few. A clock that goes back is refused, but where the number of the cycle changes, which may have its own.
+    Of two rows at one time the second is later where the step changes or the load is switched; others are left out, if few. A
+    clock that goes back is refused, but where the number of the cycle changes, which may have its own.
     """
     time_s = rows["time"].to_numpy()
     step_s = np.diff(time_s, prepend=np.nan)
