@@ -39,11 +39,12 @@ def rows_of(table: pd.DataFrame, known: Recognised, file_format: FileFormat) -> 
 
 
 def place_of(rows: pd.DataFrame, which: BoolArray | pd.Series[bool], most: int = 10) -> str:
-    """Some rows as a file counts them: as many stretches at most, and how many more there are."""
+    """Some rows as a file counts them: so many stretches of them at most, and how many rows there are."""
     places = rows.index[which].to_numpy() + 1
     parts = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
     named = ", ".join(f"{part[0]}" if len(part) == 1 else f"{part[0]} to {part[-1]}" for part in parts[:most])
-    return named + (f" and {sum(map(len, parts[most:]))} more" if len(parts) > most else "")
+    more = " and others" if len(parts) > most else ""
+    return f"{named}{more} ({len(places)} rows)" if len(places) > 1 else named
 
 
 def in_si_units(table: pd.DataFrame, known: Recognised) -> pd.DataFrame:
@@ -232,8 +233,7 @@ def without_incomplete(rows: pd.DataFrame) -> pd.DataFrame:
             faults[f"the {name} lies beyond {low:g} .. {high:g} {unit}"] = beyond
     is_faulty, most = np.any([*faults.values()], axis=0), max(2, int(FEW_SHARE * len(rows)))
     faults["there is no measurement of a cell"] = ~is_measured
-    found = {fault: bad for fault, bad in faults.items() if bad.any()}
-    told = "; ".join(f"{fault} in row {place_of(rows, bad)} ({bad.sum()} in all)" for fault, bad in found.items())
+    told = "; ".join(f"{fault} in row {place_of(rows, bad)}" for fault, bad in faults.items() if bad.any())
     if is_faulty.sum() > most:
         raise ValueError(f"{told}. Of {len(rows)} rows at most {most} are left out: remove these, or fill them in")
     if told:
