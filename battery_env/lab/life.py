@@ -192,7 +192,7 @@ def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
     unsure = known.calibrator()
     assert isinstance(held, LeastSquares)
     assert isinstance(unsure, LeastSquares)
-    return _track(discharges, settings.cut_off_V, held, unsure)
+    return _track(discharges, settings.resolved.cut_off_V, held, unsure)
 
 
 def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares, unsure: LeastSquares) -> Life:

@@ -236,7 +236,7 @@ def end_of_record(
     found = calibrated(running, _known_before(running, settings, to_come, past), to_come, end_is_asked=True)
     if not found.in_progress:
         raise ValueError(
-            f"{argument} reaches {settings.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "
+            f"{argument} reaches {settings.resolved.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "
             "forecast: calibrate it, or give a lower --cut-off"
         )
     return End(record_name(source.stem, source.cycle), found, past)

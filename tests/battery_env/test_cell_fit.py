@@ -260,14 +260,31 @@ class TestFiles:
     @pytest.mark.parametrize("method", [method for method in METHODS if method != "policy"])
     def test_settings_use_all_that_a_fit_knows(self, method, fit):
         settings = Settings(cell=fit, method=method)
-        assert (settings.constants, settings.mismatch_V, settings.cut_off_V) == (fit.cell, fit.mismatch_V, fit.cell.VEOD)
+        assert settings.constants == fit.cell
+        assert settings.resolved == (fit.cell.VEOD, fit.mismatch_V, fit.thermal)
         estimator, own = settings.calibrator(fit.cell), fit.calibrator()
         assert estimator.bounds == own.bounds and estimator.bounds["q_mobile"][1] == pytest.approx(1.2 * fit.cell.q_mobile)
-        assert Settings(cell=fit, mismatch_V=0.1).mismatch_V == 0.1 and Settings(cell=OTHER).mismatch_V == 0.05
+        assert Settings(cell=OTHER).resolved.mismatch_V == 0.05
         assert Settings(method=method).calibrator(NEW_CELL).bounds == LeastSquares().bounds == ExtendedKalmanFilter().bounds
-        assert not Settings(cell=dataclasses.replace(fit, thermal=False)).thermal
-        assert Settings(method=method).but(cell=fit) == settings and settings.but(cell=OTHER).mismatch_V == 0.05
-        assert Settings(mismatch_V=0.1).but(cell=fit).mismatch_V == 0.1
+        assert not Settings(cell=dataclasses.replace(fit, thermal=False)).resolved.thermal
+
+    @pytest.mark.parametrize("other", [Settings.but, dataclasses.replace])
+    def test_what_is_stated_stays_as_stated_with_another_cell_and_nothing_else_does(self, other, fit):
+        isothermal = dataclasses.replace(fit, thermal=False)
+        # also where what is stated is what holds when nothing is
+        for stated in ({"mismatch_V": 0.05}, {"cut_off_V": 2.7}, {"thermal": True}, {"mismatch_V": 0.1, "cut_off_V": 3.0}):
+            for cell in (fit, isothermal, OTHER, None):
+                whole = Settings(**stated, cell=cell)
+                assert other(Settings(**stated), cell=cell) == whole == other(Settings(**stated, cell=fit), cell=cell)
+                assert whole.resolved == Settings(cell=cell).resolved._replace(**stated)
+
+    def test_settings_and_keywords_say_the_same(self, fit):
+        cell = dataclasses.replace(fit, cell=fit.cell.replace(VEOD=3.0))
+        record = discharged(fit.cell, 6500.0, 0.15, fit.currents_A[0])
+        by_settings = calibrate(record, Settings(mismatch_V=0.05, cut_off_V=2.7), cell=cell)
+        by_keywords = calibrate(record, mismatch_V=0.05, cut_off_V=2.7, cell=cell)
+        assert by_settings.sd_q_mobile_C == by_keywords.sd_q_mobile_C
+        assert by_settings.capacity_Ah == by_keywords.capacity_Ah > calibrate(record, cell=cell).capacity_Ah
 
     @pytest.mark.parametrize(
         ("kind", "change", "message"),
