@@ -310,7 +310,7 @@ class Search:
 
         best = adjusted(fit.values)
         highest, ends_C = best[0], []
-        # steps upward grow along with the distance to the least value, where that is more than a step: a likelihood may be flat
+        # upward a likelihood may be flat: steps grow with the distance to the least value, where that is more than a step
         near_C = min(least_C, best_C - _STEP_SD * sd_C)
         for side in (-1, 1):
             (height, values), q_C = best, best_C

@@ -147,7 +147,7 @@ def calibrated(
     shown = model.forecast(part.record, estimate, cut_off_V, current_A)
     end = _end(part, estimate, replace(known, method=method), now or model, shown, load, samples, end_is_asked)
     charge = _charge(part, settings, estimate, end)
-    if part.start.reason or part.more_C or not _is_all_logged(part, shown, estimate):
+    if part.start.reason or part.more_C or not _is_all_logged(part, known, shown, estimate):
         charge = dict.fromkeys(charge, float("nan"))
     nominal_Ah = _nominal_Ah(model, settings, part.load.mean_A)
     eod_s, sd_eod_s = (shown.eod_time_s, float("nan")) if end is None else _middle(end.eod_time_s, estimate)
@@ -380,12 +380,13 @@ def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cu
     return more_C
 
 
-def _is_all_logged(part: _LoadedPart, forecast: VoltageForecast, estimate: Estimate) -> bool:
+def _is_all_logged(part: _LoadedPart, settings: Settings, forecast: VoltageForecast, estimate: Estimate) -> bool:
     """
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
-    record, history, parameters = Samples.of(part.record), history_of(part.record), (estimate.q_mobile, estimate.r_o)
+    record, parameters = Samples.of(part.record), (estimate.q_mobile, estimate.r_o)
+    history = history_of(part.record, settings.resolved.usual_start)
     shown = evidence_of(record, part.cell, part.start.soc, parameters, history, forecast.at_samples_V)
     # a charge that tapered off fills any cell, whatever its voltage at rest
     is_lower = shown["start"]["first_V"] < shown["start_V"] and not (history.charge and history.charge.tapered)

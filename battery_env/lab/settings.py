@@ -22,7 +22,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import Reason
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
-from battery_env.records import CUT_OFF_V
+from battery_env.records import CUT_OFF_V, DischargeStart
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -45,6 +45,7 @@ class SettingsOptions(TypedDict, total=False):
     cell: CellFit | AgingPath | CellParameters | None
     cell_rates_sd: Mapping[str, float] | None
     initial_soc: InitialSoc | Literal["rest"]
+    usual_start: DischargeStart | None
 
 
 class ResolvedSettings(NamedTuple):
@@ -53,14 +54,15 @@ class ResolvedSettings(NamedTuple):
     cut_off_V: float
     mismatch_V: float
     thermal: bool
+    usual_start: DischargeStart | None
 
 
 @dataclass(frozen=True)
 class Settings:
     """
     How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
-    ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs. What is not stated stays ``None``, so that
-    it follows another ``cell``; :attr:`resolved` has the numbers.
+    ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs. What is not stated stays ``None``, so
+    that it follows another ``cell``; :attr:`resolved` has the numbers.
 
     :param method: of calibration; ``None``: the filter for a record in progress under load, if neither a prior nor the cell is
         known, and else least squares. ``"policy"`` is the one that comes with the package, for both parameters; its model is a
@@ -81,6 +83,8 @@ class Settings:
         (:data:`battery_env.estimators.cell_fit.RATE_PRIOR_SD`), and stated ones as cells of a kind do
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: told from the voltage of the rest before the load, of a minute at least
+    :param usual_start: how discharges of this cell start, as ``Life.usual_start`` of its life tells: a start like theirs is
+        full; ``None``: as those of the fit of ``cell`` do, or as a full cell of the model rests
     :raises ValueError: for an argument out of range, and for what a policy cannot be told. What the calibrators refuse they
         refuse when :meth:`calibrator` makes them
     """
@@ -95,6 +99,7 @@ class Settings:
     cell: CellFit | AgingPath | CellParameters | None = None
     cell_rates_sd: Mapping[str, float] | None = None
     initial_soc: InitialSoc | Literal["rest"] = 1.0
+    usual_start: DischargeStart | None = None
 
     def __post_init__(self) -> None:
         if self.method not in (None, *METHODS):
@@ -120,11 +125,12 @@ class Settings:
 
     @property
     def resolved(self) -> ResolvedSettings:
-        """Cut-off, error to expect and kind of the model: as stated, or else as the cell tells."""
-        told = ResolvedSettings(CUT_OFF_V, UNFITTED_MISMATCH_V, thermal=True)
-        if isinstance(self.cell, CellFit | AgingPath):
-            thermal = isinstance(self.cell, CellFit) and self.cell.thermal
-            told = ResolvedSettings(self.cell.cell.VEOD, self.cell.mismatch_V, thermal)
+        """Cut-off, error to expect, kind of the model and usual start: as stated, or else as the cell tells."""
+        told = ResolvedSettings(CUT_OFF_V, UNFITTED_MISMATCH_V, thermal=True, usual_start=None)
+        if isinstance(self.cell, CellFit):
+            told = ResolvedSettings(self.cell.cell.VEOD, self.cell.mismatch_V, self.cell.thermal, self.cell.usual_start)
+        elif isinstance(self.cell, AgingPath):
+            told = ResolvedSettings(self.cell.cell.VEOD, self.cell.mismatch_V, thermal=False, usual_start=None)
         stated = {name: value for name in told._fields if (value := getattr(self, name)) is not None}
         return told._replace(**stated)
 
@@ -219,6 +225,7 @@ class Settings:
             "current_gain_sd": self.current_gain_sd,
             "initial_soc": stated if start is None else (start.soc, start.sd_soc),
             "q_mobile_bounds_C": self.q_mobile_bounds_C,
+            "usual_start": resolved.usual_start,
         }
         if self.method == "kalman":
             sd_r_o_ohm = self.fit.sd_r_o_ohm if self.fit else 0.0

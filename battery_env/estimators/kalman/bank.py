@@ -136,7 +136,7 @@ def _predict(one: Row, current: float, duration: float, settings: FilterSettings
 @inlined
 def _mismatch_V2(evidence: Row, settings: FilterSettings) -> float:
     # The model is no better than the voltage at rest shows, beyond noise.
-    start_V2 = (evidence.start.first_V - evidence.start_V) ** 2 - MOST_NOISE_SD**2 * settings.noise_V2
+    start_V2 = (evidence.start.first_V - evidence.model_V) ** 2 - MOST_NOISE_SD**2 * settings.noise_V2
     return start_V2 if start_V2 > settings.mismatch_V2 else settings.mismatch_V2
 
 
