@@ -21,7 +21,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.verdict import MISMATCH_MARGIN
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE
-from battery_env.records import DischargeStart
+from battery_env.records import ChargeBefore, DischargeStart
 
 #: How well the constants that say how fast a cell follows its load are known before any data, as standard deviations of their
 #: logarithms: kn of seven cells lies so far from a new one's, but for the one of NASA's that is reported.
@@ -301,7 +301,7 @@ class CellFit:
                 content[name] = tuple(row(**fields) for fields in content[name])
             if content.get("usual_start") is not None:
                 *first, charge = content["usual_start"]
-                content["usual_start"] = DischargeStart(*first, charge and tuple(charge))
+                content["usual_start"] = DischargeStart(*first, charge and ChargeBefore(*charge))
             return cls(**content)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged, or no fit saved by CellFit.to_json: {error}") from error

@@ -25,7 +25,7 @@ from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.reasons import SETTLED_SHARES, is_only_imprecise
+from battery_env.estimators.reasons import is_only_imprecise
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome
 from battery_env.records import VARIED_SHARE, DischargeStart, drawn, drawn_charge_C, mean_current_A
@@ -232,7 +232,7 @@ def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> Discharge
                 parts.append(discharge.loaded_part(cut_off_V))
     alike = starting_alike(parts)
     steps = np.abs(np.diff(np.log([drawn_charge_C(part) for part in alike])))
-    return usual_start(alike) if len(steps) and np.median(steps) < SETTLED_SHARES["q_mobile"] else None
+    return usual_start(alike) if len(steps) and np.median(steps) <= VARIED_SHARE else None
 
 
 def _row_of(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> dict[str, Any]:

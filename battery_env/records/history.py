@@ -50,22 +50,20 @@ class DischargeStart(NamedTuple):
     :param voltage_V: the first voltage, in the mean, V
     :param current_A: under which current that is, A; 0: at rest
     :param sd_V: standard deviation of that voltage between the discharges, V
-    :param charge: the highest voltage of the charge before, V, and the current at which it was held last, without a sign, A;
-        ``None``: it was not recorded
+    :param charge: the one before; ``None``: it was not recorded
     """
 
     voltage_V: float
     current_A: float
     sd_V: float = 0.0
-    charge: tuple[float, float] | None = None
+    charge: ChargeBefore | None = None
 
     @classmethod
     def of(cls, record: Any) -> DischargeStart:
         """That of any record."""
-        first_A, charge = float(record.current_A[0]), history_of(record).charge
-        is_at_rest = history_of(record).at_rest or abs(first_A) <= REST_CURRENT_A
-        charged = None if charge is None else (charge.highest_V, charge.last_A)
-        return cls(float(record.voltage_V[0]), 0.0 if is_at_rest else first_A, 0.0, charged)
+        first_A, history = float(record.current_A[0]), history_of(record)
+        is_at_rest = history.at_rest or abs(first_A) <= REST_CURRENT_A
+        return cls(float(record.voltage_V[0]), 0.0 if is_at_rest else first_A, 0.0, history.charge)
 
     def is_of_current(self, other: DischargeStart) -> bool:
         """Whether the first voltages are of one current, or both at rest, so that they can be compared."""
@@ -74,10 +72,11 @@ class DischargeStart(NamedTuple):
 
     def is_charged_like(self, other: DischargeStart, tolerance_V: float) -> bool | None:
         """Whether the charges before ended alike; ``None`` if one was not recorded."""
-        if self.charge is None or other.charge is None:
+        own, others = self.charge, other.charge
+        if own is None or others is None:
             return None
-        (own_V, own_A), (other_V, other_A) = self.charge, other.charge
-        return abs(own_V - other_V) <= tolerance_V and abs(own_A - other_A) <= _TAPER_SHARE * max(own_A, other_A)
+        is_of_current = abs(own.last_A - others.last_A) <= _TAPER_SHARE * max(own.last_A, others.last_A)
+        return is_of_current and abs(own.highest_V - others.highest_V) <= tolerance_V
 
 
 class ChargeHistory(NamedTuple):

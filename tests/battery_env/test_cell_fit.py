@@ -19,6 +19,7 @@ from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.loads import constant as constant_load
+from battery_env.records import ChargeBefore, DischargeStart
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 from tests.sweeps import sweep
 
@@ -228,9 +229,16 @@ class TestRealCells:
 
 
 class TestFiles:
-    def test_a_fit_and_constants_survive_their_files_and_are_read_for_what_they_are(self, fit, tmp_path):
+    @pytest.mark.parametrize("charge", [None, ChargeBefore(4.2, 0.05, 1.5, 600.0)])
+    def test_a_fit_and_constants_survive_their_files_and_are_read_for_what_they_are(self, charge, fit, tmp_path):
+        fit = dataclasses.replace(fit, usual_start=DischargeStart(4.18, 0.0, 0.01, charge))
         assert read_cell(fit.to_json(tmp_path / "fit.json")) == fit
         assert read_cell(OTHER.to_json(tmp_path / "constants.json")) == OTHER
+        # a fit of an older release does not tell how its discharges start
+        old = json.loads((tmp_path / "fit.json").read_text())
+        del old["usual_start"]
+        (tmp_path / "old.json").write_text(json.dumps(old))
+        assert read_cell(tmp_path / "old.json") == dataclasses.replace(fit, usual_start=None)
         (tmp_path / "other.json").write_text("{}")
         with pytest.raises(ValueError, match=r"other\.json holds no"):
             read_cell(tmp_path / "other.json")
@@ -261,7 +269,7 @@ class TestFiles:
     def test_settings_use_all_that_a_fit_knows(self, method, fit):
         settings = Settings(cell=fit, method=method)
         assert settings.constants == fit.cell
-        assert settings.resolved == (fit.cell.VEOD, fit.mismatch_V, fit.thermal)
+        assert settings.resolved == (fit.cell.VEOD, fit.mismatch_V, fit.thermal, fit.usual_start)
         estimator, own = settings.calibrator(fit.cell), fit.calibrator()
         assert estimator.bounds == own.bounds and estimator.bounds["q_mobile"][1] == pytest.approx(1.2 * fit.cell.q_mobile)
         assert Settings(cell=OTHER).resolved.mismatch_V == 0.05
@@ -298,6 +306,9 @@ class TestFiles:
             (CellParameters, lambda content: content["constants"].update(Ap=1.0), "damaged"),
             (CellParameters, lambda content: content.update(constants=[1.0]), "given by name"),
             (CellParameters, lambda content: content.pop("constants"), "damaged"),
+            (CellFit, lambda content: content.update(usual_start=[4.1]), "damaged"),
+            (CellFit, lambda content: content.update(usual_start=["full", 0.0, 0.0, None]), "damaged"),
+            (CellFit, lambda content: content.update(usual_start=[4.1, 0.0, 0.0, [4.2]]), "damaged"),
             *((CellFit, lambda content, name=name: content.pop(name), "damaged") for name in FIELDS),
             *((CellFit, lambda content, name=name: content.update({name: None}), "damaged") for name in FIELDS),
             *((CellFit, lambda content, name=name: content.update({name: [{"name": "kn"}]}), "damaged") for name in FIELDS),

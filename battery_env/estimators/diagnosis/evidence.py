@@ -200,12 +200,12 @@ def take_in(evidence: Any, history: ChargeHistory) -> None:
         start["charge"] = np.where(np.isnan(full_V), 0, np.where(is_low, -1, int(charge.tapered)))
         evidence["left_C"], start["is_cut_short"] = np.where(np.isnan(full_V), 0.0, charge.left_C), not charge.tapered
     if history.start is not None and history.usual_start is not None:
-        _expect_usual(evidence, history.start, history.usual_start, charge is not None and charge.tapered)
+        _expect_usual(evidence, history.start, history.usual_start)
     if history.load_on_C or history.offset_A:
         rest["is_over"], rest["mean_A"], rest["load_on_C"] = True, history.offset_A, history.load_on_C
 
 
-def _expect_usual(evidence: Any, own: DischargeStart, usual: DischargeStart, tapered: bool) -> None:
+def _expect_usual(evidence: Any, own: DischargeStart, usual: DischargeStart) -> None:
     """Expect a start like those of other discharges of the cell: its voltage, or its charge if the load is another one."""
     span_V = evidence["start_V"] - evidence["low_V"]
     is_like = own.is_charged_like(usual, float(np.max(span_V)))
@@ -218,8 +218,9 @@ def _expect_usual(evidence: Any, own: DischargeStart, usual: DischargeStart, tap
         return
     spread_V = _USUAL_SD * usual.sd_V
     evidence["low_V"], evidence["high_V"] = usual.voltage_V - span_V - spread_V, usual.voltage_V + ABOVE_REST_V + spread_V
-    is_low = own.charge is not None and own.charge[0] < evidence["low_V"]
-    evidence["start"]["charge"] = np.where(is_low, -1, int(tapered and is_like is not False))
+    if own.charge is not None:
+        is_low, is_full = own.charge.highest_V < evidence["low_V"], own.charge.tapered and is_like is not False
+        evidence["start"]["charge"] = np.where(is_low, -1, int(is_full))
 
 
 def measured(evidence: Any, initial_soc: float, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:

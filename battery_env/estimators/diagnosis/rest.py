@@ -11,7 +11,7 @@ import numpy as np
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
 from battery_env.estimators.reasons import Reason
-from battery_env.records import REST_CURRENT_A, STEADY_S, DischargeStart, Record, Stream
+from battery_env.records import REST_CURRENT_A, STEADY_S, ChargeBefore, DischargeStart, Record, Stream
 
 #: What a state of charge can be given as: a number, or (mean, standard deviation).
 InitialSoc = float | tuple[float, float]
@@ -116,7 +116,7 @@ def usual_start(records: Sequence[Record]) -> DischargeStart | None:
     if not starts:
         return None
     voltages_V, charges = [each.voltage_V for each in starts], [each.charge for each in starts]
-    charge = None if None in charges else tuple(np.median(charges, axis=0).tolist())
+    charge = None if None in charges else ChargeBefore(*np.median(charges, axis=0).tolist())
     return DischargeStart(float(np.mean(voltages_V)), starts[0].current_A, float(np.std(voltages_V)), charge)
 
 
