@@ -301,7 +301,7 @@ class CellFit:
                 content[name] = tuple(row(**fields) for fields in content[name])
             if content.get("usual_start") is not None:
                 *first, charge = content["usual_start"]
-                content["usual_start"] = DischargeStart(*first, charge and ChargeBefore(*charge))
+                content["usual_start"] = DischargeStart._make([*first, charge and ChargeBefore._make(charge)])
             return cls(**content)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged, or no fit saved by CellFit.to_json: {error}") from error

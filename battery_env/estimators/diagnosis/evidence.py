@@ -18,6 +18,7 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.faults import (
     KEPT,
+    MOST_NOISE_SD,
     NOISES,
     RESOLUTION_V,
     SMOOTHED_SHARE,
@@ -54,8 +55,6 @@ _RISE_V = 0.05
 # Smaller changes of the current than this, A, hardly show in the voltage. Where a load falls in such steps, a rise of the
 # voltage by this resistance, ohm, says nothing.
 _LEAST_JUMP_A, _MOST_RESISTANCE_OHM = 0.05, 0.6
-# First voltages of a cell lie within so many of their standard deviations, beside what a cell that lacks charge shows.
-_USUAL_SD = 3.0
 # A cell from which this share of its charge was drawn does not come back to the voltage of its first sample without a charge.
 _RECOVERY_SHARE = 0.2
 # A change of the voltage is compared with so many before and behind it.
@@ -216,7 +215,7 @@ def _expect_usual(evidence: Any, own: DischargeStart, usual: DischargeStart) -> 
         evidence["start"]["charge"], evidence["start"]["is_cut_short"] = 1 if is_like else -1, False
         evidence["high_V"] = np.inf
         return
-    spread_V = _USUAL_SD * usual.sd_V
+    spread_V = MOST_NOISE_SD * usual.sd_V
     evidence["low_V"], evidence["high_V"] = usual.voltage_V - span_V - spread_V, usual.voltage_V + ABOVE_REST_V + spread_V
     if own.charge is not None:
         is_low, is_full = own.charge.highest_V < evidence["low_V"], own.charge.tapered and is_like is not False

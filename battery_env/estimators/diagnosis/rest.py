@@ -115,8 +115,8 @@ def usual_start(records: Sequence[Record]) -> DischargeStart | None:
     starts = [DischargeStart.of(record) for record in starting_alike(records)]
     if not starts:
         return None
-    voltages_V, charges = [each.voltage_V for each in starts], [each.charge for each in starts]
-    charge = None if None in charges else ChargeBefore(*np.median(charges, axis=0).tolist())
+    voltages_V, charges = [each.voltage_V for each in starts], [each.charge for each in starts if each.charge is not None]
+    charge = ChargeBefore._make(np.median(charges, axis=0).tolist()) if len(charges) == len(starts) else None
     return DischargeStart(float(np.mean(voltages_V)), starts[0].current_A, float(np.std(voltages_V)), charge)
 
 

@@ -31,12 +31,11 @@ from battery_env.electrochemistry.tangents import (
     voltage_tangents,
 )
 from battery_env.estimators.diagnosis.evidence import unseen_C
-from battery_env.estimators.diagnosis.faults import KEPT, Row
+from battery_env.estimators.diagnosis.faults import KEPT, MOST_NOISE_SD, Row
 from battery_env.estimators.kalman.state import FILTER, OFFSET, FilterSettings, Q, R
 from battery_env.estimators.reasons import Reason
 from battery_env.estimators.verdict import (
     MISMATCH_MARGIN,
-    MOST_NOISE_SD,
     PRIOR_LIMIT_SD,
     is_plausible,
     judge,
