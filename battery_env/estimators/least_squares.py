@@ -19,13 +19,13 @@ from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.evidence import dropouts_s, evidence_of, measured, unseen_C
 from battery_env.estimators.diagnosis.knee import knee_sd_C
+from battery_env.estimators.diagnosis.faults import MOST_NOISE_SD
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.reasons import Reason
 from battery_env.estimators.search import MARGIN, Fit, JointPrior, Prior, Search, root_inverse_diagonal, square
 from battery_env.estimators.verdict import (
-    MOST_NOISE_SD,
     PRIOR_LIMIT_SD,
     SPARE_SAMPLES,
     Assumptions,
@@ -36,7 +36,7 @@ from battery_env.estimators.verdict import (
     white_noise_V,
 )
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
-from battery_env.records import ChargeHistory, Record, Samples, check_record, drawn_charge_C, history_of
+from battery_env.records import ChargeHistory, DischargeStart, Record, Samples, check_record, drawn_charge_C, history_of
 from battery_env.records.model import RecordModel
 
 # Noise told from residuals is not below the resolution of a voltmeter, V.
@@ -123,6 +123,8 @@ class LeastSquares(Estimator):
         to those of the parameters. :func:`battery_env.soc_from_rest` tells it from the voltage of the rest before the load
     :param path: how cells of this kind age (:func:`battery_env.fit_life`): which constants, ``q_mobile`` and ``r_o`` go
         together before this record is seen. ``cell`` and ``mismatch_V`` are those of the path by default
+    :param usual_start: how other discharges of the cell start, which the record is compared with; ``None``: as a full cell of
+        the model rests
     :raises ValueError: for an argument out of range
     """
 
@@ -143,10 +145,11 @@ class LeastSquares(Estimator):
         nuisance: Mapping[str, float] | None = None,
         initial_soc: InitialSoc = 1.0,
         path: AgingPath | None = None,
+        usual_start: DischargeStart | None = None,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
-        self.path = path
+        self.path, self.usual_start = path, usual_start
         # so many times larger than the fit says are standard deviations, but for that of a prior
         self._sd_ratio = 1.0 if path is None else path.sd_ratio
         if path is not None:
@@ -216,7 +219,7 @@ class LeastSquares(Estimator):
 
     def _history(self, record: Record) -> ChargeHistory:
         # where another charge is stated, that before the load does not count
-        history = history_of(record)
+        history = history_of(record, self.usual_start)
         return history if self.initial_soc[0] == 1.0 else history._replace(charge=None)
 
     def _estimate(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> Estimate:

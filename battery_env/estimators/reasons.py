@@ -116,6 +116,11 @@ class Reason(_Row):
         "not rested, holds another charge, or is another kind of cell. Give the whole discharge of a full cell with a minute "
         "at rest before it, state initial_soc (--initial-soc), or fit constants to such cells (fit_cell, --cell)."
     )
+    START_UNLIKE = (
+        "The record starts at {first_V:.2f} V under {first_A:.3g} A, where the discharges of its life, or of its fit, do at "
+        "{rest_V:.2f} V under {usual_A:.3g} A: it was charged or has rested otherwise, or is of another cell. Give one that "
+        "starts as they do, or state initial_soc (--initial-soc)."
+    )
     OTHER_LOAD = (
         "The load, {load_A:.3g} A, is none of those that the constants were fitted to, {fitted} A, and they hold for these: "
         "fit discharges of this load, too."

@@ -29,8 +29,6 @@ from battery_env.parameters import PARAMETER_NAMES
 PLAUSIBLE_Q_SHARES = (0.2, 5.0)
 #: The error of the model may be this much larger than stated before the residuals contradict it.
 MISMATCH_MARGIN = 2.0
-#: A voltage farther off than so many standard deviations of its noise shows an error of the model, or of the sensor.
-MOST_NOISE_SD = 3.0
 #: So many samples more than parameters tell how large the noise is.
 SPARE_SAMPLES = 10
 #: A prior contradicts the record beyond so many standard deviations of their difference. Within it, a prior of the settled
