@@ -18,8 +18,8 @@ from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_er
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.evidence import dropouts_s, evidence_of, measured, unseen_C
-from battery_env.estimators.diagnosis.knee import knee_sd_C
 from battery_env.estimators.diagnosis.faults import MOST_NOISE_SD
+from battery_env.estimators.diagnosis.knee import knee_sd_C
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
