@@ -191,8 +191,6 @@ class LAC(CostAlgorithm):
             sde_sample_freq=sde_sample_freq,
             use_sde_at_warmup=use_sde_at_warmup,
         )
-        # Files name it. Those that do not are of before sb3_lac 0.7, when it was the fourth
-        self.policy_kwargs = {"root": 2, **self.policy_kwargs}
         if _init_setup_model:
             self._setup_model()
 
