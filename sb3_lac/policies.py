@@ -90,6 +90,13 @@ class LyapunovCritic(BaseModel):
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
 
+    def __getattr__(self, name: str) -> Any:
+        if name == "q_networks":
+            raise AttributeError(
+                "A critic of costs has lyapunov_networks and no q_networks: the largest of their values counts."
+            )
+        return super().__getattr__(name)
+
     def forward(self, obs: PyTorchObs, actions: th.Tensor, as_values: bool = True) -> tuple[th.Tensor, ...]:
         """
         Get the values ``L(s, a)``, none of them negative, or what the networks give. An update of LAC asks for the latter:
