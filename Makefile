@@ -17,12 +17,14 @@ help:  ## list the commands
 # pip has much to say: it is shown only if the command fails
 logged = ($(1)) > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log >&2; exit 1; }
 comma := ,
-EXTRAS := zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs
+$(VENV)/.installed: EXTRAS := zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs
+# what the demo needs; after make install it needs nothing more
+$(VENV)/.demo: EXTRAS := zoo$(comma)demo
 # without the RL Zoo, which needs a newer Stable-Baselines3
 OLDEST_EXTRAS := peers$(comma)onnx$(comma)dev$(comma)docs
 
 # one stamp per state of the packaging files: made again when they change
-$(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/pyproject.toml
+$(VENV)/.installed $(VENV)/.demo: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")'
 	@echo "making $(VENV)"
 	@mkdir -p $(VENV)
@@ -30,13 +32,13 @@ $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/p
 	@$(call logged,$(BIN)/python -m pip install --upgrade pip)
 	@echo "installing $(TORCH)"
 	@$(call logged,$(BIN)/python -m pip install $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)")
-	@echo "installing battery_env and sb3_lac, with all extras"
+	@echo "installing battery_env and sb3_lac, with the extras $(EXTRAS)"
 	@$(call logged,$(BIN)/python -m pip install --editable ./battery_env --editable ".[$(EXTRAS)]")
 	@touch $@
 
 install: $(VENV)/.installed  ## make .venv with everything in it
 
-demo: install  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some minutes; figures in results/
+demo: $(firstword $(wildcard $(VENV)/.installed) $(VENV)/.demo)  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some minutes; figures in results/
 	$(BIN)/python -m benchmarks.demo
 
 test: install  ## all tests of the product but attacks

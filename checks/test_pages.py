@@ -27,6 +27,14 @@ def test_commands_in_pages_exist():
                 assert re.search(rf"^{words[1]}:", makefile, flags=re.MULTILINE), f"{page.name}: {line}"
 
 
+def test_pages_agree_on_how_long_the_demo_takes():
+    said = [
+        re.findall(r"make demo\b[^\n]*: ([^:\n]+ minutes) on two cores", text_of(ROOT / name))
+        for name in ("README.md", "docs/install.md")
+    ]
+    assert said[0] == said[1] and len(said[0]) == 1
+
+
 def test_links_between_pages_lead_somewhere():
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text_of(page)):
