@@ -31,7 +31,7 @@ $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/p
 	@echo "installing $(TORCH)"
 	@$(call logged,$(BIN)/python -m pip install $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)")
 	@echo "installing battery_env and sb3_lac, with all extras"
-	@$(call logged,$(BIN)/python -m pip install --editable ./battery_env --editable ".[$(EXTRAS)]")
+	@$(call logged,$(BIN)/python -m pip install --editable "./battery_env[cyclers]" --editable ".[$(EXTRAS)]")
 	@touch $@
 
 install: $(VENV)/.installed  ## make .venv with everything in it
