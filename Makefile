@@ -33,7 +33,7 @@ $(VENV)/.installed $(VENV)/.demo: setup.cfg pyproject.toml battery_env/setup.cfg
 	@echo "installing $(TORCH)"
 	@$(call logged,$(BIN)/python -m pip install $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)")
 	@echo "installing battery_env and sb3_lac, with the extras $(EXTRAS)"
-	@$(call logged,$(BIN)/python -m pip install --editable ./battery_env --editable ".[$(EXTRAS)]")
+	@$(call logged,$(BIN)/python -m pip install --editable "./battery_env[cyclers]" --editable ".[$(EXTRAS)]")
 	@touch $@
 
 install: $(VENV)/.installed  ## make .venv with everything in it

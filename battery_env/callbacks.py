@@ -19,7 +19,7 @@ try:
     from stable_baselines3.common.logger import Figure, TensorBoardOutputFormat
 except ImportError as error:
     raise ImportError(
-        "battery_env.callbacks needs Stable-Baselines3, install it with: pip install 'battery_env[sb3]'"
+        "battery_env.callbacks needs Stable-Baselines3, install it with: pip install './battery_env[sb3]'"
     ) from error
 
 #: Charts of the errors for TensorBoard's Custom Scalars tab, as ``SummaryWriter.add_custom_scalars()`` takes them.

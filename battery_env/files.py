@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
+import pickle
 import secrets
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -177,3 +180,21 @@ def check_unpacked(packed_bytes: int, unpacked_bytes: int) -> None:
     """Refuse what would become far larger than it is, as no file of measurements does."""
     if unpacked_bytes > max(LARGEST_UNPACKED_BYTES, MOST_UNPACKED * packed_bytes):
         raise ValueError(f"{packed_bytes} bytes would become more than {unpacked_bytes >> 20} MiB: unpack it by hand")
+
+
+def call_alone(module: str, name: str, *arguments: Any, **options: Any) -> Any:
+    """
+    Call a function that damaged files may lead to end its process, in a process of its own.
+
+    :param module: where it is, found as here
+    :param name: what it is called there
+    :param arguments: that have literals, and return what can be pickled, likewise ``options``
+    :raises ValueError: with what the process says last, or how it ended
+    """
+    code = f"import sys; sys.path[:] = {sys.path!r}\nimport pickle, {module}\n"
+    code += f"pickle.dump({module}.{name}(*{arguments!r}, **{options!r}), sys.stdout.buffer)"
+    process = subprocess.run([sys.executable, "-c", code], stdin=subprocess.DEVNULL, capture_output=True)
+    if process.returncode:
+        lines = process.stderr.decode(errors="replace").splitlines()
+        raise ValueError(lines[-1] if lines else f"{module}.{name} ended its process with {process.returncode}")
+    return pickle.loads(process.stdout)

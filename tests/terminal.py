@@ -35,6 +35,6 @@ class Terminal:
         self.capsys.readouterr()
         assert calibrate([*map(str, arguments)]) == 2
         captured = self.capsys.readouterr()
-        *_, error = captured.err.splitlines()
-        assert captured.out == "" and error.startswith("error: ")
-        return error
+        *_, error = captured.err.partition("error: ")
+        assert captured.out == "" and error
+        return f"error: {' '.join(error.split())}"

@@ -151,7 +151,7 @@ def workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
         try:
             from distributed import Client
         except ImportError as error:
-            raise ImportError("--scheduler needs Dask: pip install 'battery_env[cluster]'") from error
+            raise ImportError("--scheduler needs Dask: pip install './battery_env[cluster]'") from error
         try:
             # one that is there answers within milliseconds
             client = Client(scheduler, timeout=5, set_as_default=False)
@@ -186,7 +186,7 @@ def attempt(function: Callable[..., Any], *arguments: Any) -> Attempt:
 
 
 def _message(error: Exception) -> str:
-    text = " ".join(str(error).split())
+    text = str(error).strip()
     expected = (ValueError, TypeError, OSError, ImportError)
     return text if isinstance(error, expected) and text else f"{type(error).__name__}: {text}"
 
@@ -219,6 +219,7 @@ class Outcome:
     :param source: file or bundled cell
     :param cell: that of the source
     :param cycle: number of the discharge; ``None`` if it has none
+    :param start_time: date and time at which it begins; empty if it has none
     :param found: what it says; ``None`` if it could not be used
     :param notes: warnings
     :param error: why it could not be used, empty otherwise
@@ -228,6 +229,7 @@ class Outcome:
     source: str
     cell: str
     cycle: int | None
+    start_time: str = ""
     found: Calibration | None = None
     notes: str = ""
     error: str = ""
@@ -239,8 +241,8 @@ class Outcome:
 
     def row(self) -> dict[str, Any]:
         """The columns of the table by name; no text is taken for a formula."""
-        told = {"record": self.record, "source": self.source, "cell": self.cell, "cycle": self.cycle}
-        row = told | (self.found.row() if self.found else {}) | {"notes": self.notes, "error": self.error}
+        told = {name: getattr(self, name) for name in ("record", "source", "cell", "cycle", "start_time")}
+        row = told | (self.found.row() if self.found else {}) | {"notes": self.notes, "error": " ".join(self.error.split())}
         return {name: no_formula(printable(value)) if isinstance(value, str) else value for name, value in row.items()}
 
     @classmethod
@@ -357,7 +359,8 @@ class Results:
         os.fsync(self._stream.fileno())
 
     def _sorted_rows(self) -> list[dict[str, Any]]:
-        order = {key: number for number, key in enumerate(self._stamps)}
+        starts = {key: row["start_time"] for (key, number), row in self._rows.items() if number == 0 and not row["error"]}
+        order = {key: number for number, key in enumerate(_by_date(list(self._stamps), starts))}
         keys = sorted(self._rows, key=lambda key: (order.get(key[0], len(order)), *key))
         return [self._rows[key] for key in keys]
 
@@ -383,6 +386,14 @@ class Results:
     def has_numbers(self) -> bool:
         """Whether any discharge could be used."""
         return any(not row["error"] for row in self._rows.values())
+
+
+def _by_date(keys: Sequence[str], starts: Mapping[str, str]) -> list[str]:
+    """Files in their order, but in each folder by the dates at which they start, where each that was read has one."""
+    folder = {key: os.path.dirname(key) for key in (*keys, *starts)}
+    rank = {name: number for number, name in enumerate(dict.fromkeys(folder.values()))}
+    undated = {folder[key] for key, start in starts.items() if not start}
+    return sorted(keys, key=lambda key: (rank[folder[key]], "" if folder[key] in undated else starts.get(key, "")))
 
 
 def _draw_life(whole: pd.DataFrame, path: Path) -> None:
@@ -452,7 +463,15 @@ def calibrate_all(
     reads = ((source, executor.submit(attempt, read_source, source, file_format)) for source in to_read)
 
     def calls() -> Iterator[tuple[_Place, Future[Attempt]]]:
+        starts: dict[str, str] = {}  # the latest in each folder
         for source, read in _in_order(reads, ahead):
+            start, folder = _start_of(read), os.path.dirname(source.key)
+            latest = starts.setdefault(folder, start)
+            if folder and start and start < latest:
+                read.notes.append(
+                    f"starts on {start:.10}, and a file before it on {latest:.10}: records are printed by their names"
+                )
+            starts[folder] = max(latest, start)
             for place, recording in _places(source, read, used):
                 name = place.known.record
                 if recording is None:
@@ -467,6 +486,11 @@ def calibrate_all(
         yield outcome
 
 
+def _start_of(read: Attempt) -> str:
+    """Date and time at which what was read starts; empty if it does not tell."""
+    return str(read.result[0].meta.get("start_time", "")) if read.result else ""
+
+
 def _places(source: Source, read: Attempt, used: set[str]) -> Iterator[tuple[_Place, Recording | None]]:
     """The discharges of a source, each with what was recorded; or the error of the source, without."""
     if read.error:
@@ -478,7 +502,8 @@ def _places(source: Source, read: Attempt, used: set[str]) -> Iterator[tuple[_Pl
     for number, recording in enumerate(read.result):
         cycle = recording.meta.get("cycle")
         name = _unused(record_name(source.stem, cycle), used)
-        known = Outcome(name, source.path, source.cell, cycle, notes="; ".join(read.notes))
+        start = str(recording.meta.get("start_time", ""))
+        known = Outcome(name, source.path, source.cell, cycle, start, notes="; ".join(read.notes))
         yield _Place(known, source, number, len(read.result)), recording
 
 

@@ -35,7 +35,7 @@ from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Method, Settings, SettingsOptions
 from battery_env.lab.sources import find_sources, read_source
 from battery_env.loads import Load, LoadToCome, constant
-from battery_env.parameters import Q_MOBILE
+from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import STEADY_S, ExpectedCurrent, Samples, drawn, expected_current, history_of, mean_current_A
 from battery_env.records.discharge import Discharge
@@ -49,6 +49,8 @@ _MODEL_STEP_S = 1.0
 _MORE_SHARE = 0.2
 # So near to a bound, as a share of it, a search ended at it.
 _AT_BOUND = 1e-3
+# The smallest cell of the model, with a resistance that lets its voltage fall most.
+_SMALLEST = Estimate(min(Q_MOBILE.limits), max(R_O.limits), settled=False)
 # Nine of ten values of a normal distribution lie within so many standard deviations.
 _BAND_SD = 1.645
 
@@ -141,28 +143,32 @@ def calibrated(
     is_whole = not np.isnan(discharge.eod_time_s(settings.resolved.cut_off_V))
     known = settings if is_whole else settings.with_nominal_prior()
     part = _look_at(discharge, known)
+    if end_is_asked and _is_below_all_sizes(part):
+        raise ValueError(_below_all_sizes())
     estimate, method, model, now = _estimate(part, known, load)
     # a cell in progress has not ended, however low its model comes in the pulses before
     cut_off_V, current_A = (-np.inf, 0.0) if part.in_progress else (settings.resolved.cut_off_V, part.load.mean_A)
     shown = model.forecast(part.record, estimate, cut_off_V, current_A)
-    end = _end(part, estimate, replace(known, method=method), now or model, shown, load, samples, end_is_asked)
+    sized = _of_its_size(estimate, settings, float(part.loaded.charge_C))
+    end = None
+    if end_is_asked or np.isfinite(sized.q_mobile):  # what has no size has no end
+        end = _end(part, estimate, replace(known, method=method), now or model, shown, load, samples, end_is_asked)
     charge = _charge(part, settings, estimate, end)
     if part.start.reason or part.more_C or not _is_all_logged(part, known, shown, estimate):
         charge = dict.fromkeys(charge, float("nan"))
     nominal_Ah = _nominal_Ah(model, settings, part.load.mean_A)
     eod_s, sd_eod_s = (shown.eod_time_s, float("nan")) if end is None else _middle(end.eod_time_s, estimate)
-    estimate = _of_its_size(estimate, settings, float(part.loaded.charge_C))
     return Calibration(
         cycle=discharge.meta.get("cycle"),
         method=method,
-        q_mobile_C=estimate.q_mobile,
-        sd_q_mobile_C=estimate.sd_q_mobile,
-        r_o_ohm=estimate.r_o,
-        sd_r_o_ohm=estimate.sd_r_o,
-        settled=estimate.settled,
-        settled_q_mobile=estimate.settled_q_mobile,
-        settled_r_o=estimate.settled_r_o,
-        reason=estimate.reason,
+        q_mobile_C=sized.q_mobile,
+        sd_q_mobile_C=sized.sd_q_mobile,
+        r_o_ohm=sized.r_o,
+        sd_r_o_ohm=sized.sd_r_o,
+        settled=sized.settled,
+        settled_q_mobile=sized.settled_q_mobile,
+        settled_r_o=sized.settled_r_o,
+        reason=sized.reason,
         initial_soc=part.start.soc,
         sd_initial_soc=part.start.sd_soc,
         samples=len(part.loaded.time_s),
@@ -230,7 +236,9 @@ def _estimate(
     method = settings.method or ("kalman" if is_running and is_new else "least-squares")
     calibrator = replace(settings, method=method).calibrator(part.cell, part.start)
     cell, thermal, now = part.cell, settings.resolved.thermal, None
-    if isinstance(calibrator, ExtendedKalmanFilter):
+    if _is_below_all_sizes(part):
+        estimate = _SMALLEST
+    elif isinstance(calibrator, ExtendedKalmanFilter):
         estimate = last_estimate(calibrator.follow(part.fitted))
         # under other loads the filter, which takes the error of the model for noise, is surer than it may be
         now = calibrator.now() if is_running and load is None and not part.load.varied else None
@@ -245,6 +253,21 @@ def _estimate(
     return estimate, method, model, now
 
 
+def _is_below_all_sizes(part: _LoadedPart) -> bool:
+    """Whether the smallest cell of the model ends above a record, so that a search, which may take minutes, is in vain."""
+    if part.loaded.charge_C > _SMALLEST.q_mobile:
+        return False
+    model = RecordModel(part.cell, initial_soc=part.start.soc)
+    shown = model.forecast(part.fitted, _SMALLEST, cut_off_V=-np.inf, future_current_A=0.0)
+    return bool(shown.at_samples_V[-1] > part.fitted.voltage_V[-1])
+
+
+def _below_all_sizes() -> str:
+    return (
+        f"Cells below {_SMALLEST.q_mobile / 3.6:.0f} mAh are not modelled, nor fitted: what was drawn is known, and no more."
+    )
+
+
 def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Estimate:
     """Without numbers where the search ended at its bound, as for a cell of far another size: a bound is no result."""
     low_C, high_C = settings.q_mobile_bounds_C
@@ -253,9 +276,8 @@ def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Esti
         return estimate
     nothing: dict[str, Any] = dict.fromkeys(("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"), float("nan"))
     reason = estimate.reason
-    if drawn_C < Q_MOBILE.limits[0]:
-        least_mAh = Q_MOBILE.limits[0] / 3.6
-        reason = f"Cells below {least_mAh:.0f} mAh are not modelled, nor fitted: what was drawn is known, and no more."
+    if drawn_C < _SMALLEST.q_mobile:
+        reason = _below_all_sizes()
     return replace(estimate, **nothing, reason=reason)
 
 

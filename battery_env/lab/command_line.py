@@ -457,13 +457,13 @@ def _page(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         prog=f"{_NAME} page",
         description="Open a page in the browser: drop files, see q_max, R_o, health and the life, forecast the end.",
-        epilog="Needs the extra page: pip install 'battery_env[page]'. Nothing leaves this machine, or stays on its disk.",
+        epilog="Needs the extra page: pip install './battery_env[page]'. Nothing leaves this machine, or stays on its disk.",
         allow_abbrev=False,
     )
     parser.add_argument("--port", type=int, default=8501, metavar="N", help="of the page, or the next free one (%(default)s)")
     options = parser.parse_args(arguments)
     if find_spec("streamlit") is None or find_spec("plotly") is None:
-        raise ImportError("the page needs Streamlit and Plotly: pip install 'battery_env[page]'")
+        raise ImportError("the page needs Streamlit and Plotly: pip install './battery_env[page]'")
     serve(Path(__file__).with_name("page.py"), options.port)
     return SETTLED
 

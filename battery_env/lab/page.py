@@ -135,6 +135,8 @@ def answer(files: list[Any], folder: str, is_one_cell: bool, file_format: FileFo
         seen, notes, error = attempt(looked_at, name, cell, recording, state.settings)
         troubles += [f"**{name}**: {each}" for each in (*notes, error) if each]
         state.found += [seen] if seen else []
+    if all(each.discharge.meta.get("start_time") for each in state.found):
+        state.found.sort(key=lambda each: each.discharge.meta["start_time"])
     bar.empty()
     state.troubles = [each.replace(f"{given}{os.sep}", "") for each in dict.fromkeys(troubles) if each]
 

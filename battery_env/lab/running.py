@@ -197,7 +197,11 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
             except (TypeError, ValueError) as error:
                 warnings.warn(f"{source.path}:{number} is left out: {error}", stacklevel=2)
     everything = [*before, *after]
-    if all(each.meta.get("start_time") for each in everything) and (began or named is before):
+    are_dated = all(each.meta.get("start_time") for each in everything)
+    if len(sources) > 1 and not are_dated:
+        order = ", ".join(dict.fromkeys(str(each.meta.get("source")) for each in everything))
+        warnings.warn(f"--life: in the order of names, as not all records have dates: {order}", stacklevel=2)
+    if are_dated and (began or named is before):
         everything.sort(key=lambda each: each.meta["start_time"])
         before = [each for each in everything if not began or each.meta["start_time"] < began]
     if not before:

@@ -40,7 +40,7 @@ class OnnxPolicy:
         try:
             from onnxruntime import InferenceSession, SessionOptions
         except ImportError as error:
-            raise ImportError(f"{error}: OnnxPolicy needs pip install 'battery_env[onnx]'") from error
+            raise ImportError(f"{error}: OnnxPolicy needs pip install './battery_env[onnx]'") from error
 
         path = Path(path)
         options = SessionOptions()

@@ -264,6 +264,13 @@ class Discharge:
             end_s = float(self.time_s[last])
         time_s = np.concatenate([[start_s], self.time_s[(self.time_s > start_s) & (self.time_s < end_s)], [end_s]])
         if len(time_s) < LEAST_SAMPLES:
+            under_load_V = self.voltage_V[first : last + 1]
+            if (above := int((under_load_V > cut_off_V).sum())) + LEAST_SAMPLES <= len(under_load_V):
+                rest = f", but for {above} samples," if above else ""
+                raise ValueError(
+                    f"all of the voltage under load{rest} lies below the cut-off of {cut_off_V:g} V: state where it ends, "
+                    f"--cut-off {under_load_V[under_load_V > 0.0].min(initial=cut_off_V):.4g} (Python: cut_off_V)"
+                )
             raise ValueError(
                 f"only {len(time_s)} samples lie between load-on at {start_s:g} s and {cut_off_V:g} V or the end of the load; "
                 f"at least {LEAST_SAMPLES} are needed"

@@ -168,7 +168,7 @@ def test_default_metrics_are_those_of_the_parameters_that_the_environment_finds(
 def test_without_stable_baselines3_the_extra_is_named(monkeypatch):
     monkeypatch.delitem(sys.modules, "battery_env.callbacks")
     monkeypatch.setitem(sys.modules, "stable_baselines3.common.base_class", None)
-    with pytest.raises(ImportError, match=r"callbacks needs Stable-Baselines3.* pip install 'battery_env\[sb3\]'"):
+    with pytest.raises(ImportError, match=r"callbacks needs Stable-Baselines3.* pip install './battery_env\[sb3\]'"):
         importlib.import_module("battery_env.callbacks")
 
 

@@ -1,4 +1,5 @@
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
+from battery_env.files import call_alone
+from battery_env.lab.readers import nasa
 from battery_env.lab.readers.discharges import read_discharges
 from battery_env.records import drawn, resample_current
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge, load_nasa_discharges
+from tests.sweeps import sweep
 
 
 def recorded(**changes) -> dict:
@@ -254,6 +258,22 @@ class TestNasaMatFile:
         path = self.write(tmp_path / "B0018.mat", broken=True)
         with pytest.warns(UserWarning, match="discharge 2: 2 rows are no discharge.* It is left out"):
             assert [discharge.meta["cycle"] for discharge in read_discharges(path)] == [1]
+
+    @pytest.mark.parametrize("at", sweep(448, *range(128, 1024, 16)))
+    def test_a_tag_that_is_damaged_does_not_end_the_process_that_asks_for_a_file(self, at, tmp_path):
+        path = self.write(tmp_path / "B0018.mat")
+        content = bytearray(path.read_bytes())
+        content[at : at + 4] = (20).to_bytes(4, "little")  # no kind of number
+        path.write_bytes(content)
+        with warnings.catch_warnings(), suppress(ValueError):
+            warnings.simplefilter("ignore")
+            read_discharges(path)
+
+    def test_a_reader_that_dies_is_an_error_of_its_file_alone(self, tmp_path, monkeypatch):
+        self.write(tmp_path / "B1.mat")
+        monkeypatch.setattr(nasa, "call_alone", lambda *given, **options: call_alone("os", "_exit", 139))
+        with pytest.raises(ValueError, match=r"B1\.mat is damaged, .*os\._exit ended its process with 139"):
+            read_discharges(tmp_path / "B1.mat")
 
     @pytest.mark.parametrize("content", [{"x": np.ones(3)}, {"B1": {"cycle": {"type": "discharge", "time": np.ones(2)}}}])
     def test_other_files_are_refused(self, content, tmp_path):

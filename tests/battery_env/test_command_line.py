@@ -216,7 +216,7 @@ POLICY = ["B0005:100", "--method", "policy"]
         (["wild.csv"], "wild: the voltage falls to 0.00 V at 937.578 s"),
         (["B0005:1", "--cell", "missing.json"], "no file 'missing.json' for --cell"),
         (["B0005:1", "--prior", "1.9", "0.1"], "Ampere-hours"),
-        (["B0005:1", "--cut-off", "4.3"], "between load-on at 26.242 s and 4.3 V"),
+        (["B0005:1", "--cut-off", "4.3"], "all of the voltage under load lies below the cut-off of 4.3 V"),
         (["B0005:1", "--nominal", "0"], "the nominal capacity in Ah must be a positive, finite number, got 0.0"),
         ([*POLICY, "--prior", "5000", "50"], "the policy that comes with the package takes no prior_q_mobile_C"),
     ],

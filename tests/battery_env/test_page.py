@@ -144,7 +144,7 @@ def test_whoever_starts_the_page_without_a_secret_address_offers_no_folder():
 
 def test_without_streamlit_the_command_says_what_to_install(monkeypatch, terminal):
     monkeypatch.setattr("battery_env.lab.command_line.find_spec", lambda name: None)
-    assert "pip install 'battery_env[page]'" in terminal.refuses("page")
+    assert "pip install './battery_env[page]'" in terminal.refuses("page")
 
 
 def test_the_page_opens_without_a_question_and_answers_nobody_without_its_address(start_page):

@@ -114,7 +114,7 @@ def test_where_there_is_none_the_error_names_those_there_are(env_id):
 
 def test_without_onnxruntime_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ImportError, match=r"needs pip install 'battery_env\[onnx\]'"):
+    with pytest.raises(ImportError, match=r"needs pip install './battery_env\[onnx\]'"):
         PolicyEstimator.pretrained()
 
 

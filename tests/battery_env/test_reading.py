@@ -18,6 +18,8 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from battery_env import calibrate, read_discharges
+from battery_env.estimators.least_squares import LeastSquares
+from battery_env.lab import calibrate as calibrate_module
 from battery_env.lab import running as running_module
 from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.readers.columns import FileFormat, recognise
@@ -70,6 +72,10 @@ READ = {
     "a sensor that is not connected": (named(**{"Temperature (C)": -2501.7}), NOT_NEEDED),
     "dashes": (named(**{"Temperature (C)": "--"}), NOT_NEEDED),
     "an unknown unit": (named(**{"Temperature (furlong)": 25.0}), ""),
+    "two names that agree": (
+        named("time/s", "U/V", "I/A", **{"time/h": RECORD.time_s / 3600.0, "U/mV": (1e3 * TABLE["voltage"]).round()}),
+        "",
+    ),
     "no number of cycles": (named(Cycle=6.283), NOT_NEEDED),
     "three electrodes": (ELECTRODES, ""),
     "two electrodes": (ELECTRODES.drop(columns="Ewe-Ece/V"), "the voltage is Ewe/V less Ece/V"),
@@ -131,11 +137,15 @@ PUT_BACK = DATES - pd.to_timedelta(3600.0 * (RECORD.time_s > 900.0), unit="s")
 REFUSED = {
     "no time": (
         TABLE[["voltage", "current"]],
-        r"no column for the time\. header voltage, current; row 1 .*--columns time=NAME",
+        r"no column for the time\. header voltage, current; row 1 .*\n.*--columns time=NAME",
     ),
     "two of a name": (
         named("time/s", "U/V", "I/A", **{"time/h": 1.0, "I/mA": 1.0}),
-        r"both 'time/s' and 'time/h' may be the time: --columns time=NAME, or --ignore NAME .*both 'I/A' and 'I/mA'",
+        r"both 'time/s' and 'time/h' may be the time: --columns time=NAME, or --ignore NAME",
+    ),
+    "two of a name that differ in one part": (
+        named("time", "U/V", "I", **{"U/mV": 1e3 * TABLE["voltage"] - np.where(TABLE.index > 250, 50.0, 0.0)}),
+        r"both 'U/V' and 'U/mV' may be the voltage",
     ),
     "an unknown unit": (named("time (furlong)", "U", "I"), r"no column for the time\. header time \(furlong\), U, I"),
     "several cells": (named(**{"Cell ID": np.where(LOADED, "A", "B")}), r"'Cell ID' names 2 cells \(B, A\): give each a file"),
@@ -232,7 +242,8 @@ def test_what_is_refused_says_why(table, message):
         warnings.simplefilter("ignore")
         with pytest.raises(ValueError, match=message) as caught:
             read_discharges(table)
-    assert "\n" not in str(caught.value)
+    _, *commands = str(caught.value).splitlines()
+    assert all(line.startswith("  battery-calibrate DataFrame --columns ") for line in commands)
 
 
 TEXT = TABLE.to_csv(index=False)
@@ -252,6 +263,11 @@ TEXTS = {
         TEXT.replace(",", ";").replace(".", ",").replace("\n", "\nNext step\n", 30),
         "no measurement",
     ),
+    "names behind the last field": (TEXT.replace(HEADER, HEADER + ",VAR1,VAR2"), "longer than the rows: VAR1, VAR2 left out"),
+    "names behind an empty field": (
+        TEXT.replace(HEADER, HEADER + ",VAR1,VAR2").replace("\n", ",\n").replace(",", "\t"),
+        "longer than the rows: VAR2 left out",
+    ),
     "strokes and signs of typographers": (TEXT.replace(",", "|").replace("-", "\u2212"), ""),
     "lines of old computers": (TEXT.replace("\n", "\r"), ""),
     "a byte of an unknown origin": (b"\0" + TEXT.encode(), "NUL bytes, which are no text, are left out"),
@@ -266,9 +282,12 @@ TEXTS = {
 NO_TEXTS = {
     "a row of titles": (
         "Old cell\nload of 350 mA at 5V\n\n" + "\n".join(LINES),
-        "no line with the names of the columns above",
+        "no column for the time, the voltage, the current. header 1, 2, 3",
     ),
-    "numbers without names": ("\n".join(LINES), "no line with the names of the columns above the numbers"),
+    "names with blanks": (
+        "Test Time Volts Amps Temp\n" + "\n".join(f"{line.replace(',', ' ')} 25" for line in LINES),
+        "4 fields below 5 names, .*than the blanks in names",
+    ),
     "more numbers than names": (TEXT.replace(".", ","), "fields below 3 names.*another delimiter than the decimal comma"),
     "quotes that do not end": (TEXT.replace("\n", '\n"', 90), r"the column 'time' must hold numbers, got '0\.0,4"),
     "layers of rows": (
@@ -451,6 +470,44 @@ def test_the_charge_of_a_cell_of_any_size_is_known_and_where_that_is_another_its
     assert "nan" not in str(found)
 
 
+def small_cell(highest_V=4.3, lowest_V=3.0, mAh=1.27, rows=95, hours=34.0):
+    """A half cell of so little charge, slowly discharged after a rest of two rows."""
+    time_h = np.linspace(0.0, hours, rows)
+    fall_V = (highest_V - lowest_V) * (np.arange(rows) / rows) ** 2
+    current_A = np.where(np.arange(rows) < 2, 0.0, 1e-3 * mAh / hours)
+    return pd.DataFrame({"time (h)": time_h, "voltage (V)": highest_V - fall_V, "current (A)": -current_A})
+
+
+@pytest.mark.parametrize("ends", ["whole", "above the cut-off"])
+def test_nothing_is_searched_for_what_is_far_below_the_sizes_of_the_model(ends, monkeypatch):
+    def search(*given, **options):
+        raise AssertionError("searched")
+
+    monkeypatch.setattr(LeastSquares, "estimate", search)
+    monkeypatch.setattr(calibrate_module, "forecast", search)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        (found,) = calibrate(small_cell(lowest_V=2.6 if ends == "whole" else 3.0))
+        assert found.drawn_Ah == pytest.approx(1.27e-3, rel=0.05) and found.reason.startswith("Cells below 28 mAh are not")
+        assert found.capacity_Ah == pytest.approx(found.drawn_Ah) if ends == "whole" else np.isnan(found.capacity_Ah)
+        (record,) = read_discharges(small_cell())
+        with pytest.raises(ValueError, match="Cells below 28 mAh are not modelled"):
+            running_module.forecast_end(record)
+
+
+@pytest.mark.parametrize("lowest_V", [0.02, 0.8, 1.5])
+def test_a_voltage_below_the_cut_off_is_refused_with_one_that_is_reached(lowest_V):
+    table = small_cell(lowest_V + 0.9, lowest_V)
+    with pytest.raises(
+        ValueError, match=r"all of the voltage under load lies below the cut-off of 2\.7 V: .*--cut-off"
+    ) as caught:
+        calibrate(table)
+    cut_off_V = float(re.search(r"--cut-off (\S+)", str(caught.value))[1])
+    assert cut_off_V == pytest.approx(table["voltage (V)"].min(), rel=1e-3)
+    (found,) = calibrate(table, cut_off_V=cut_off_V)
+    assert found.measured_eod_time_s > 0.0 and found.drawn_Ah == pytest.approx(1.27e-3, rel=0.05)
+
+
 @pytest.mark.parametrize("gain", [0.5, 0.97, 1.03, 2.0])
 @pytest.mark.parametrize("method", ["least-squares", "kalman"])
 def test_another_count_of_the_tester_is_a_doubt_of_its_size(gain, method):
@@ -521,12 +578,44 @@ def test_a_refused_file_shows_the_command_that_reads_it(tmp_path, capsys):
     path = tmp_path / "cell.csv"
     table = pd.DataFrame({"time_s": RECORD.time_s, "batt_mV": 1e3 * RECORD.voltage_V, "load_mA": 1e3 * RECORD.current_A})
     table.to_csv(path, index=False)
-    said = rf"row 1 0\.0, 418.*row 2 9.*time 'time_s' in s.*--columns voltage=batt_mV,current=load_mA.*columns {path}"
+    said = (
+        rf"row 1 0\.0, 418.*row 2 9.*time 'time_s' in s.*columns {path} writes:\n.*--columns voltage=batt_mV,current=load_mA"
+    )
     with pytest.raises(ValueError, match=said) as caught:
         read_discharges(path)
     stated = re.search(r"--columns (\S+)", str(caught.value))[1]
     assert command([str(path), "--columns", stated]) == 0
     assert command([str(path), "--columns", stated, "--ignore", "batt_mV"]) == 2
+
+
+@pytest.mark.parametrize(
+    "title", ["", "Old cell\nload of 350 mA at 5 V\n\n", "@Model:X; Hardware:V2.00\n\n", "0,,,Version=1.30\n"]
+)
+@pytest.mark.parametrize(("delimiter", "end"), sweep((",", "\r"), (";", "\n"), ("\t", "\r\n"), ("  ", "\n"), ("|", "\n")))
+def test_a_log_without_names_shows_how_places_are_stated_and_is_read_by_them(title, delimiter, end, tmp_path, capsys):
+    path = tmp_path / "log of a charger.txt"
+    hundredths_A, mV = (-100.0 * TABLE["current"]).round(2), 1e3 * TABLE["voltage"]
+    rows = [
+        delimiter.join(map(str, row)) for row in zip(mV, "$" + mV.index.astype(str), hundredths_A, RECORD.time_s, strict=True)
+    ]
+    path.write_text(title.replace("\n", end) + end.join(rows), newline="")
+    assert command([str(path)]) == 2
+    said = capsys.readouterr().err
+    assert "--columns time=1,voltage=2,current=3 (and --units current=0.01A)" in said and "row 1 4182.85" in said
+    *_, shown = said.splitlines()
+    assert shown == f"  battery-calibrate '{path}' --columns time=1,voltage=2,current=3"
+    stated = {"columns": {"time": "4", "voltage": "1", "current": "3"}, "units": {"voltage": "mV", "current": "0.01A"}}
+    near(read(path, discharge_is_negative=False, **stated))
+    assert command(["columns", str(path), "--out", str(tmp_path / "my.toml")]) == 3
+
+
+@pytest.mark.parametrize("content", ["text", "workbook"])
+def test_a_place_is_stated_where_a_name_does_not_tell_or_comes_twice(content, tmp_path):
+    table, path = TABLE.set_axis(["a", "b", "b"], axis="columns"), tmp_path / f"cell.{'csv' if content == 'text' else 'xlsx'}"
+    table.to_csv(path, index=False) if content == "text" else table.to_excel(path, index=False)
+    near(read(path, columns={"time": "a", "voltage": "2", "current": "3"}))
+    with pytest.raises(ValueError, match="there is no column '4' for the current among a, b, b"):
+        read_discharges(path, columns={"time": "a", "voltage": "2", "current": "4"})
 
 
 def test_a_tester_is_told_by_its_names_or_added_by_a_file(tmp_path, monkeypatch, terminal):
@@ -585,7 +674,8 @@ def test_a_life_is_in_the_order_of_its_dates_or_else_of_its_names(tmp_path):
     running = Source("B0005", 1, "B0005", "B0005", "B0005:1")
     found = running_module.read_life([str(tmp_path)], running, FileFormat())
     assert [Path(each.meta["source"]).name for each in found] == ["cell_10.csv", "cell_2.csv"]
-    found = running_module.read_life([str(tmp_path)], running, FileFormat(ignore=["Date"]))
+    with pytest.warns(UserWarning, match=r"in the order of names, as not all records have dates: .*cell_2.csv, .*cell_10.csv"):
+        found = running_module.read_life([str(tmp_path)], running, FileFormat(ignore=["Date"]))
     assert [Path(each.meta["source"]).name for each in found] == ["cell_2.csv", "cell_10.csv"]
     # and what began after the one in progress is no part of it, whatever its name
     running = Source(str(tmp_path / "cell_2.csv"), None, "cell_2", "", "cell_2.csv")

@@ -283,6 +283,24 @@ def test_what_a_power_cut_left_of_a_run_is_gone_on_from(left, quick, pair, monke
     assert Path("out/estimate.csv").read_bytes() == whole
 
 
+@pytest.mark.parametrize("dates", [("2011-01-10", "2010-12-13"), ("2011-01-10", None)])
+def test_the_table_of_a_folder_is_in_the_order_of_its_dates_and_names_another_one(dates, quick, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    table = pd.read_csv(write(load_nasa_discharges("B0006")[1], "table.csv"))
+    Path("lab").mkdir()
+    for name, date in zip(("cell_1_10_11.csv", "cell_12_13_10.csv"), dates, strict=True):
+        clock = {} if date is None else {"Date": pd.Timestamp(date) + pd.to_timedelta(table["time_s"], unit="s")}
+        table.assign(**clock).to_csv(Path("lab", name), index=False)
+    for _ in range(2):  # the second goes on from the first
+        assert command("lab --out out".split()) == 0
+    rows = pd.read_csv("out/estimate.csv", dtype={"start_time": str})
+    names = ["cell_12_13_10", "cell_1_10_11"]
+    assert rows["record"].tolist() == (names if dates[1] else names[::-1])
+    assert rows["start_time"].str[:10].fillna("").tolist() == (sorted(dates) if dates[1] else [dates[0], ""])
+    said = "cell_12_13_10: starts on 2010-12-13, and a file before it on 2011-01-10: records are printed by their names"
+    assert (said in capsys.readouterr().err) == (dates[1] is not None)
+
+
 def test_a_file_that_has_changed_is_read_again(pair, capsys):
     arguments = "lab --out out --table-only".split()
     assert command(arguments) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -50,6 +51,8 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
 }
 # Units stand in brackets, or behind a stroke, or are the last word.
 _UNIT = re.compile(r"[(\[](?P<bracket>[^()\[\]]*)[)\]]|/(?P<stroke>[^/]*)$")
+# A stated unit may have a number, as in 0.01 A.
+_SCALED = re.compile(r"^\s*(\d+\.?\d*|\.\d+|)(.*)")
 # A unit of text such as 1:02:03.5, which becomes seconds when it is read, by its letters.
 _CLOCK = re.compile(r"(?:hours?in)?h+m+(?:in)?s+[msfxz]*$")
 # What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
@@ -92,9 +95,8 @@ class Recognised(NamedTuple):
     """What is known of a table by its header."""
 
     tester: Tester
-    columns: dict[str, Column]  # by quantity
+    columns: dict[str, Column]  # by quantity; of names as good as that of voltage, voltage2 is the second
     missing: list[str]  # quantities that a record must have
-    doubts: list[str]  # what the caller must say of those that are there
     names: Sequence[str]  # all of the table
     rows: Sequence[Sequence[str]]  # fields of its first rows
     source: str
@@ -113,21 +115,22 @@ class Recognised(NamedTuple):
         return [name for n, name in enumerate(self.names) if name and n not in used]
 
     def check(self) -> Recognised:
-        """Refuse a table of which a quantity is missing or in doubt."""
-        missing = [f"no column for the {', the '.join(self.missing)}"] if self.missing else []
-        if missing or self.doubts:
-            raise self.refusal(". ".join([*missing, *self.doubts]))
+        """Refuse a table of which a quantity is missing."""
+        if self.missing:
+            raise self.refusal(f"no column for the {', the '.join(self.missing)}")
         return self
 
     def refusal(self, reason: object) -> ValueError:
         """Why the table is not read, with its first lines, what is known of it, and what reads it."""
         likely = {each: [name for name in self._unused() if _unit_in(name, each)] for each in self.missing}
         columns = [f"{each}={names[0] if len(names) == 1 else 'NAME'}" for each, names in likely.items()]
+        if self.names[:1] == ["1"]:
+            columns = [f"{each}={place}" for place, each in enumerate(self.missing, start=1)]
         told = "; ".join(" ".join(line.split()) for line in self.lines())
+        command = ["battery-calibrate", self.source, "--columns", ",".join(columns) or "time=NAME"]
         return ValueError(
-            f"{str(reason).rstrip('.')}. {told}. Where this is wrong say what is what: --columns "
-            f"{','.join(columns) or 'time=NAME'} (Python: columns), or fill in the file that battery-calibrate columns "
-            f"{self.source} writes"
+            f"{str(reason).rstrip('.')}. {told}. Where this is wrong name columns, or their places (Python: columns), or fill "
+            f"in the file that {shlex.join(['battery-calibrate', 'columns', self.source])} writes:\n  {shlex.join(command)}"
         )
 
 
@@ -144,42 +147,44 @@ def recognise(
     keys = {key for label in labels for key, _ in _parted(label)}
     marked = [each for each in TESTERS if any("".join(words_of(name)) in keys for name in each.told_by)]
     tester = file_format.tester or (joined(marked[0], TESTERS[-1]) if marked else TESTERS[-1])
-    chosen, units = file_format.columns or {}, {**tester.units, **(file_format.units or {})}
-    _check_stated(chosen, units, names)
+    units = {**tester.units, **(file_format.units or {})}
+    chosen = _places_of(file_format.columns or {}, units, names)
     ranks = [_ranks(label, tester) for label in labels]
-    found, doubts = dict[str, Column](), list[str]()
+    found = dict[str, Column]()
     for quantity in QUANTITIES:
         if quantity in INSTEAD["current"] and ("current" in found or file_format.load):
             continue
         # a column is one thing, but where the caller says otherwise
-        used = {column.name for column in found.values()} | {name.strip() for name in chosen.values()}
-        free = {n: each[quantity] for n, each in enumerate(ranks) if quantity in each and names[n] not in used}
+        used = {column.position for column in found.values()} | set(chosen.values())
+        free = {n: each[quantity] for n, each in enumerate(ranks) if quantity in each and n not in used}
         places = [n for n, rank in free.items() if rank == min(free.values())]
         if quantity in chosen:
-            places = [names.index(chosen[quantity].strip())]
-        for place in places[:1]:
-            unit = _unit(units.get(quantity, ""), quantity) or _unit_in(labels[place], quantity)
+            places = [chosen[quantity]]
+        scale, stated = _SCALED.findall(units.get(quantity, ""))[0]
+        for number, place in enumerate(places if quantity in REQUIRED else places[:1], start=1):
+            unit = _unit(stated, quantity) or _unit_in(labels[place], quantity)
             if unit or quantity not in _WITH_UNIT:
                 factor, offset = _UNITS.get(quantity, {}).get(unit, (1.0, 0.0))
-                found[quantity] = Column(place, names[place], unit, factor, offset)
-        if len(places) > 1 and quantity in REQUIRED:
-            both = " and ".join(repr(names[place]) for place in places)
-            doubts.append(f"both {both} may be the {quantity}: --columns {quantity}=NAME, or --ignore NAME (Python: ignore)")
+                key = quantity if number == 1 else f"{quantity}{number}"
+                found[key] = Column(place, names[place], unit, float(scale or 1.0) * factor, offset)
     given = {"current"} if file_format.load else set[str]()
     missing = [each for each in REQUIRED if not {each, *INSTEAD.get(each, ())} & (set(found) | given)]
-    return Recognised(tester, found, missing, doubts, names, rows, source)
+    return Recognised(tester, found, missing, names, rows, source)
 
 
-def _check_stated(columns: Mapping[str, str], units: Mapping[str, str], names: Sequence[str]) -> None:
+def _places_of(columns: Mapping[str, str], units: Mapping[str, str], names: Sequence[str]) -> dict[str, int]:
+    """Which column is stated for each quantity, by its name, or else by its place from 1 on."""
     for option, told in (("columns", columns), ("units", units)):
         if unknown := set(told) - set(QUANTITIES):
             raise ValueError(f"{option} knows {', '.join(QUANTITIES)}, got {', '.join(sorted(unknown))}")
+    known = [*names, *(str(n + 1) for n in range(len(names)))]
     for quantity, name in columns.items():
-        if name.strip() not in names:
+        if name.strip() not in known:
             raise ValueError(f"there is no column {name!r} for the {quantity} among {', '.join(filter(None, names))}")
     for quantity, unit in units.items():
         if quantity in _UNITS and not _unit(unit, quantity):
             raise ValueError(f"the unit {unit!r} of the {quantity} is not known, but {', '.join(_UNITS[quantity])}")
+    return {quantity: known.index(name.strip()) % len(names) for quantity, name in columns.items()}
 
 
 def _labels(names: Sequence[str], rows: Sequence[Sequence[str]], ignore: Collection[str]) -> list[str]:

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
 
 from battery_env.arrays import FloatArray
+from battery_env.files import call_alone
 from battery_env.records.discharge import NASA_CITATION
 
 
@@ -17,14 +17,12 @@ def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """The discharges of one of NASA's own files before they are checked."""
     content: dict[str, Any] = {}
     try:
-        content = loadmat(path, simplify_cells=True)
+        content = call_alone("scipy.io", "loadmat", str(path), simplify_cells=True)
         ((cell, value),) = ((name, value) for name, value in content.items() if isinstance(value, dict) and "cycle" in value)
         return _samples_of_mat(cell, value)
-    except FileNotFoundError:
-        raise
     except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
         names = ", ".join(name for name in content if not name.startswith("__"))
-        where = f"one of its variables ({names}) must be a cell with its cycles" if content else repr(error)
+        where = f"one of its variables ({names}) must be a cell with its cycles" if content else error
         raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {where}") from error
 
 

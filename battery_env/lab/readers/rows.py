@@ -52,13 +52,25 @@ def in_si_units(table: pd.DataFrame, known: Recognised) -> pd.DataFrame:
     found: dict[str, Any] = {}
     for quantity, column in known.columns.items():
         try:
-            found[quantity] = _READ[quantity](table[quantity], column)
+            found[quantity] = _READ[quantity.rstrip("0123456789")](table[quantity], column)
         except Exception as error:  # pandas raises whatever a value leads it to
             what = "" if column.name in str(error) else f"the column {column.name!r} cannot be read: "
             if quantity in REQUIRED or REQUIRED[0] not in table or quantity == "cell":
                 raise ValueError(f"{what}{error}") from error
             say(f"{what}{error}. It is left out")
+    _check_twins(found, known.columns)
     return pd.DataFrame(found, index=table.index)
+
+
+def _check_twins(found: Mapping[str, FloatArray], columns: Mapping[str, Column]) -> None:
+    """Refuse columns that have equally good names for a quantity and are not the same."""
+    for key in [each for each in found if each not in _READ]:
+        quantity = key.rstrip("0123456789")
+        if not np.nanmax(np.abs(found[key] - found[quantity])) <= NOTHING_SHARE * np.nanmax(np.abs(found[key])):
+            both = " and ".join(repr(columns[each].name) for each in (quantity, key))
+            raise ValueError(
+                f"both {both} may be the {quantity}: --columns {quantity}=NAME, or --ignore NAME (Python: ignore)"
+            )
 
 
 def numbers(values: pd.Series, column: Column) -> FloatArray:
@@ -223,7 +235,8 @@ def without_incomplete(rows: pd.DataFrame) -> pd.DataFrame:
     is connected; and without a few in which the time, the voltage or the current is missing, or none that a cell has.
     """
     is_known = np.isfinite(rows[list(REQUIRED)])
-    is_no_cell = (rows["voltage"] < 0.1 * rows["voltage"].median()) & (rows["current"].abs() <= REST_CURRENT_A)
+    rest_A = min(REST_CURRENT_A, NOTHING_SHARE * rows["current"].abs().max())  # which a small cell yields in full
+    is_no_cell = (rows["voltage"] < 0.1 * rows["voltage"].median()) & (rows["current"].abs() <= rest_A)
     is_measured = is_known.any(axis=1) & ~(is_no_cell & (is_no_cell.cummin() | is_no_cell[::-1].cummin()))
     faults = {f"the {name} is missing": ~is_known[name] & is_measured for name in REQUIRED}
     for name, (low, high, unit, _) in zip(("voltage", "current"), PLAUSIBLE.values(), strict=False):

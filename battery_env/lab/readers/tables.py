@@ -21,7 +21,7 @@ import pandas as pd
 
 from battery_env.files import LARGEST_UNPACKED_BYTES
 from battery_env.lab.readers.columns import FileFormat, Recognised, are_units, count_required, say
-from battery_env.lab.readers.testers import ENCODINGS
+from battery_env.lab.readers.testers import ENCODINGS, REQUIRED
 
 Key = TypeVar("Key")
 
@@ -76,12 +76,9 @@ def open_frame(table: pd.DataFrame) -> Opened:
     def read(found: Recognised) -> pd.DataFrame:
         return pd.DataFrame({key: table.iloc[:, column.position] for key, column in found.columns.items()})
 
-    return Opened([str(name) for name in table.columns], _first_rows(table), read)
-
-
-def _first_rows(table: pd.DataFrame) -> list[list[str]]:
     first = table.head(_FIRST_ROWS).astype(object)
-    return [[str(value) for value in row] for row in first.where(first.notna(), "").to_numpy()]
+    rows = [[str(value) for value in row] for row in first.where(first.notna(), "").to_numpy()]
+    return Opened([str(name) for name in table.columns], rows, read)
 
 
 def _check(count: int, most: int, what: str) -> None:
@@ -180,8 +177,9 @@ def _open_text(content: bytes, file_format: FileFormat) -> Opened:
         tables |= {(encoding, delimiter): [_fields(line, delimiter) for line in lines] for delimiter in _DELIMITERS}
         if encoding == "utf-8":
             break
-    (encoding, delimiter), number = _find_header(tables, file_format)
-    names, *rows = map(_filled, tables[encoding, delimiter][number : number + 1 + _FIRST_ROWS])
+    (encoding, delimiter), number, names = _find_header(tables, file_format)
+    below = tables[encoding, delimiter][number + 1 : number + 1 + _FIRST_ROWS]
+    rows = [*map(_filled, below)]
     _check(len(names), _MOST_COLUMNS, "columns")
     has_units = bool(rows) and are_units(rows[0])
     values = [row for row in rows[has_units:] if row]
@@ -189,21 +187,25 @@ def _open_text(content: bytes, file_format: FileFormat) -> Opened:
         raise ValueError("there are no rows below the header")
     if not names[0] and 0 < 2 * sum(row[0] != "" for row in values) < len(values):
         raise ValueError("rows of cycles, steps and records are in one table: export the records alone")
-    wider = [len(row) for row in values if len(row) > len(names)]
-    if 2 * len(wider) > len(values):
+    # a name may hold blanks
+    odd = [len(row) for row in values if len(row) > len(names) or (len(row) < len(names) and delimiter == _BLANKS)]
+    if 2 * len(odd) > len(values):
         raise ValueError(
-            f"rows have {wider[0]} fields below {len(names)} names, which does not tell what is what: name each column, and "
-            "take another delimiter than the decimal comma"
+            f"rows have {odd[0]} fields below {len(names)} names, which does not tell what is what: name each column, and "
+            "take another delimiter than the decimal comma, or than the blanks in names"
         )
+    width = max(map(len, below[has_units:]))
+    if names[width:]:
+        say(f"the header is longer than the rows: {', '.join(names[width:])} left out")
     numbers = [field for row in values for field in row if _NUMBER.match(field)]
     options: dict[str, Any] = {
         "sep": delimiter,
         "decimal": "," if 2 * sum("," in field for field in numbers) > len(numbers) else ".",
         "encoding": encoding,
         "skiprows": number + 1 + has_units,
-        "names": range(max(map(len, [names, *values]))),
+        "names": range(width),
     }
-    return Opened(names, rows, lambda found: _read_text(content, options, found))
+    return Opened(names[:width], rows, lambda found: _read_text(content, options, found))
 
 
 def _read_text(content: bytes, options: dict[str, Any], found: Recognised) -> pd.DataFrame:
@@ -228,34 +230,40 @@ def _read_text(content: bytes, options: dict[str, Any], found: Recognised) -> pd
     return pd.DataFrame({key: table[column.position] for key, column in found.columns.items()})
 
 
-def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: FileFormat) -> tuple[Key, int]:
+def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: FileFormat) -> tuple[Key, int, list[str]]:
     """
     In which of some tables, by delimiter or by sheet, and in which of its rows the names of the columns are: above rows of
-    numbers in as many fields, those of most quantities of a record.
+    numbers in as many fields, or in fewer below names of a whole record, those of most quantities. Where there are none the
+    row is that above the numbers, and the names are places.
     """
     candidates: dict[tuple[str, ...], tuple[bool, int, int, int, Key]] = {}  # by names, which may come again
-    has_numbers = False
+    most, first, of_most = 0, 0, next(iter(tables))  # numbers in rows of them, the first of these rows, and their table
     for key, rows in tables.items():
-        counts = np.array([sum(bool(_NUMBER.match(field)) for field in row) for row in rows])
+        counts = np.array([sum(bool(_NUMBER.match(field)) for field in row) for row in rows], dtype=np.int64)
+        are_numbers = counts > 1
         # a delimiter may end each
         widths = np.array([(len(row), len(_filled(row))) for row in rows]).reshape(-1, 2)
-        has_numbers |= bool((counts > 1).any())
+        if (count := int(counts[are_numbers].sum())) > most:
+            most, first, of_most = count, int(are_numbers.argmax()), key
         for n, row in enumerate(rows[:_HEAD_LINES]):
             if any(row) and not counts[n]:
-                below = slice(n + 1, n + 1 + _FIRST_ROWS)
-                fits = int(((widths[below] == widths[n]).any(axis=1) & (counts[below] > 1)).sum())
-                found = (bool(fits), count_required(row, file_format), fits, n, key)
-                candidates.setdefault(tuple(_filled(row)), found)
-    if not candidates and not has_numbers:
+                below, quantities = slice(n + 1, n + 1 + _FIRST_ROWS), count_required(row, file_format)
+                fits = int(((widths[below] == widths[n]).any(axis=1) & are_numbers[below]).sum())
+                is_longer = quantities == len(REQUIRED) and bool((widths[below] < widths[n]).all(axis=1) @ are_numbers[below])
+                candidates.setdefault(tuple(_filled(row)), (fits > 0 or is_longer, quantities, fits, n, key))
+    if not candidates and not most:
         raise ValueError("the file is empty")
-    best = max(candidates.values(), key=lambda each: each[:4], default=(False, 0, 0, 0, next(iter(tables))))
-    if has_numbers and not any(best[:2]):
-        raise ValueError("there is no line with the names of the columns above the numbers. Add one")
-    _, quantities, _, number, key = best
+    best = max(candidates.values(), key=lambda each: each[:4], default=(False, 0, 0, 0, of_most))
+    is_header, quantities, _, number, key = best
+    if most and not is_header and quantities < len(REQUIRED):
+        if not (file_format.columns or file_format.tester):
+            say("no line names the columns: state places, --columns time=1,voltage=2,current=3 (and --units current=0.01A)")
+        width = max(len(_filled(row)) for row in tables[of_most][first:])
+        return of_most, first - 1, [str(n + 1) for n in range(width)]
     first = next(each[3] for each in candidates.values() if each[:2] == best[:2])
     if quantities and first != number:
         say(f"the header is line {number + 1}; the table of line {first + 1} is left out")
-    return key, number
+    return key, number, _filled(tables[key][number])
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
@@ -283,7 +291,7 @@ def _reading(kind: str, extra: str = "") -> Iterator[None]:
     except (FileNotFoundError, IsADirectoryError, PermissionError, TooLargeError):
         raise
     except ImportError as error:
-        raise ImportError(f"{kind} files need an extra: pip install 'battery_env[{extra}]' ({error})") from error
+        raise ImportError(f"{kind} files need an extra: pip install './battery_env[{extra}]' ({error})") from error
     except Exception as error:  # whatever the damage leads to
         raise ValueError(f"the file is damaged, or no {kind} file: {str(error).strip() or type(error).__name__}") from error
 
@@ -297,10 +305,10 @@ def _read_workbook(path: Path, file_format: FileFormat) -> pd.DataFrame:
             for sheet in book.worksheets:
                 sheet.reset_dimensions()  # which a single cell in the last corner makes
             sheets = {sheet.title: _rows_of_sheet(sheet.title, sheet.iter_rows(values_only=True)) for sheet in book.worksheets}
-    title, line = _find_header({each: rows[: _HEAD_LINES + _FIRST_ROWS] for each, rows in sheets.items()}, file_format)
-    header = sheets[title][line]
+    beginnings = {title: rows[: _HEAD_LINES + _FIRST_ROWS] for title, rows in sheets.items()}
+    title, line, header = _find_header(beginnings, file_format)
     parts = [rows[rows.index(header) + 1 :] for rows in sheets.values() if header in rows[:_HEAD_LINES]]
-    width = len(header)
+    parts, width = parts or [sheets[title][line + 1 :]], len(header)
     return pd.DataFrame([[*row, *[""] * width][:width] for rows in parts for row in rows], columns=header)
 
 

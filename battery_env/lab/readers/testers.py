@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
@@ -19,6 +19,8 @@ else:
 
 # Words end at a capital, too, as in TestTime; a word of a sentence, with a mark at its end, is no name.
 _GAP = re.compile(r"(?<=[a-zäöü]{2})(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~{}()\[\]/]|[,:](?=.)|(?<=[_\s])in(?=[_\s]))+")
+# Text of TOML, whose basic strings are those of JSON.
+_quoted = partial(json.dumps, ensure_ascii=False)
 #: So long are names, and what is shown of a line.
 LONGEST = 200
 #: What a column may hold, and what a record must have.
@@ -215,8 +217,3 @@ def tester_file(columns: Mapping[str, Any], names: Sequence[str], rows: Sequence
             text = getattr(columns.get(quantity), attribute, "")
             lines.append(f"{'' if text else '# '}{quantity} = {_quoted(text)}")
     return "\n".join([*lines, ""])
-
-
-def _quoted(text: str) -> str:
-    """Text of TOML, whose basic strings are those of JSON."""
-    return json.dumps(text, ensure_ascii=False)
