@@ -6,7 +6,7 @@ TORCH ?= torch==2.13.0
 TORCH_INDEX ?=
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := sb3_lac battery_env benchmarks tests examples docs
+SOURCES := sb3_lac battery_env benchmarks checks tests examples docs
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-attacks test-browser test-oldest format lint type-check docs commit-checks clean
@@ -17,12 +17,16 @@ help:  ## list the commands
 # pip has much to say: it is shown only if the command fails
 logged = ($(1)) > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log >&2; exit 1; }
 comma := ,
-EXTRAS := zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs
+$(VENV)/.installed: BATTERY_ENV := ./battery_env[cyclers]
+$(VENV)/.installed: EXTRAS := zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs
+# what the demo needs; after make install it needs nothing more
+$(VENV)/.demo: BATTERY_ENV := ./battery_env
+$(VENV)/.demo: EXTRAS := zoo$(comma)demo
 # without the RL Zoo, which needs a newer Stable-Baselines3
 OLDEST_EXTRAS := peers$(comma)onnx$(comma)dev$(comma)docs
 
 # one stamp per state of the packaging files: made again when they change
-$(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/pyproject.toml
+$(VENV)/.installed $(VENV)/.demo: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")'
 	@echo "making $(VENV)"
 	@mkdir -p $(VENV)
@@ -30,16 +34,16 @@ $(VENV)/.installed: setup.cfg pyproject.toml battery_env/setup.cfg battery_env/p
 	@$(call logged,$(BIN)/python -m pip install --upgrade pip)
 	@echo "installing $(TORCH)"
 	@$(call logged,$(BIN)/python -m pip install $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)")
-	@echo "installing battery_env and sb3_lac, with all extras"
-	@$(call logged,$(BIN)/python -m pip install --editable "./battery_env[cyclers]" --editable ".[$(EXTRAS)]")
+	@echo "installing battery_env and sb3_lac, with the extras $(EXTRAS)"
+	@$(call logged,$(BIN)/python -m pip install --editable '$(BATTERY_ENV)' --editable ".[$(EXTRAS)]")
 	@touch $@
 
 install: $(VENV)/.installed  ## make .venv with everything in it
 
-demo: install  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some minutes; figures in results/
+demo: $(firstword $(wildcard $(VENV)/.installed) $(VENV)/.demo)  ## LAC, SAC and TD3 learn R_o, then the life of a real cell: some minutes; figures in results/
 	$(BIN)/python -m benchmarks.demo
 
-test: install  ## all tests but attacks
+test: install  ## all tests of the product but attacks
 	$(BIN)/python -m pytest -n 2 --dist worksteal  # neighbours share their fixtures, and no worker is idle in the end
 
 test-attacks: install  ## attacks: sweeps over faults, their sizes and places, studies, and what trains long
@@ -61,9 +65,10 @@ format: install  ## black, and what ruff can mend
 	$(BIN)/python -m ruff check --fix $(SOURCES)
 	$(BIN)/python -m black --quiet $(SOURCES)
 
-lint: install  ## what ruff and black find
+lint: install  ## what ruff, black and the rules of checks/ find: of code, sizes, pages, the reference and published tables
 	$(BIN)/python -m ruff check $(SOURCES)
 	$(BIN)/python -m black --check --quiet $(SOURCES)
+	$(BIN)/python -m pytest -q checks
 
 type-check: install  ## mypy
 	$(BIN)/python -m mypy

@@ -20,8 +20,17 @@ LOAD_UNIT_SYMBOLS: dict[str, str] = {"power": "W", "current": "A"}
 ZERO_CELSIUS_K = 273.15
 
 
+def check_real(name: str, values: object) -> None:
+    """Refuse truth values and complex numbers, of which numpy makes other numbers."""
+    array = np.asarray(values, dtype=None if hasattr(values, "dtype") else object)
+    for value in array.flat if array.dtype.kind == "O" else array.flat[:1]:
+        if isinstance(value, bool | np.bool_ | complex | np.complexfloating):
+            raise TypeError(f"{name} must hold real numbers, got {value!r}")
+
+
 def check_numbers(name: str, values: ArrayLike, unit: str = "") -> FloatArray:
     """Refuse what is no number."""
+    check_real(name, values)
     try:
         return np.asarray(values, dtype=np.float64)
     except (OverflowError, TypeError, ValueError) as error:

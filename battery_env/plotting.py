@@ -72,6 +72,12 @@ def literal(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def titles_of(figure: Figure) -> dict[str, str]:
+    """The titles of a figure, as the metadata of its PNG: readable without looking at it."""
+    titles = [figure.get_suptitle(), *(axes.get_title() for axes in figure.axes)]
+    return {"Title": "; ".join(filter(None, titles))}
+
+
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """
     Save a figure; the file is written beside its place and renamed, so that it is never there in part.
@@ -81,7 +87,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """
     with replacing(path) as part:
         # not the resolution of matplotlib's settings, which other libraries change
-        figure.savefig(part, dpi="figure")
+        figure.savefig(part, dpi="figure", metadata=titles_of(figure) if part.suffix == ".png" else None)
     return Path(path)
 
 

@@ -3,7 +3,7 @@ The picture of the page on TensorBoard that is drawn from event files, as the ex
 
 .. code-block:: bash
 
-  python -m docs.scalars_picture runs
+  python -m docs.scalars_picture comparison
 """
 
 from __future__ import annotations

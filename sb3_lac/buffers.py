@@ -90,7 +90,9 @@ _SAMPLED_AT_ONCE = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplay
 
 def batches_at_once(buffer: BaseBuffer, batch_size: int) -> int:
     """Number of batches that may be sampled from a replay buffer in one call."""
-    if type(buffer) not in _SAMPLED_AT_ONCE:
+    # A method may have been replaced on the instance alone, as ``sample`` by one that adds demonstrations
+    replaced = any(callable(getattr(type(buffer), name, None)) for name in vars(buffer))
+    if replaced or type(buffer) not in _SAMPLED_AT_ONCE:
         return 1
     space = buffer.observation_space
     observed = space.spaces.values() if isinstance(space, spaces.Dict) else [space]

@@ -13,6 +13,8 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.sac.policies import Actor
+from torch.nn.modules.module import _has_any_global_hook
+from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
 from sb3_lac.buffers import Samples
 
@@ -34,23 +36,28 @@ _UNASKED = ("CLOSURE_MATCH", "DICT_NOT_CONTAINS", "DUPLICATE_INPUT", "HASATTR", 
 Metrics = tuple[tuple[str, ...], th.Tensor]
 
 
-def set_gradients(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
-    """Let what an optimizer changes have the gradient of a loss, and nothing else that the loss depends on."""
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    trained = [parameter for parameter in parameters if parameter.requires_grad]
-    if not th.compiler.is_compiling():
+def set_gradients(*losses: tuple[BaseModel, th.Tensor]) -> None:
+    """
+    Let each network have the gradient of its loss, and nothing else that the loss depends on. Parameters that none of the
+    optimizers holds, as of an encoder that somebody else steps, add it to the gradient that they have.
+    """
+    held = [[each for group in network.optimizer.param_groups for each in group["params"]] for network, _ in losses]
+    of_all = {id(parameter) for parameters in held for parameter in parameters}
+    for (network, loss), parameters in zip(losses, held, strict=True):
+        trained = [parameter for parameter in parameters if parameter.requires_grad]
+        if th.compiler.is_compiling():
+            # All that is trained is held, see ``not_in_a_graph()``
+            gradients = th.autograd.grad(loss, trained, materialize_grads=True) if trained else ()
+            for parameter, gradient in zip(trained, gradients, strict=True):
+                set_gradient(parameter, gradient)
+            continue
         # Without ``zero_grad()``, whose records for the profiler take longer than its work
         for parameter in parameters:
             parameter.grad = None
-    if not trained:
-        # The whole network is frozen, as an actor whose values are to be learned
-        return
-    if th.compiler.is_compiling():
-        gradients = th.autograd.grad(loss, trained, materialize_grads=True)
-        for parameter, gradient in zip(trained, gradients, strict=True):
-            set_gradient(parameter, gradient)
-    else:
-        loss.backward(inputs=trained)
+        trained += [each for each in network.parameters() if each.requires_grad and id(each) not in of_all]
+        # The whole network may be frozen, as an actor whose values are to be learned
+        if trained:
+            loss.backward(inputs=trained)
 
 
 def set_gradient(parameter: th.Tensor, gradient: th.Tensor) -> None:
@@ -92,6 +99,42 @@ def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, 
     set_gradient(log_multiplier, -violation.reshape(1))
     step(optimizer)
     return loss
+
+
+def modules_of(network: th.nn.Module) -> list[th.nn.Module]:
+    """As ``network.modules()``, in a tenth of the time."""
+    modules = [network]
+    for module in modules:
+        modules += [part for part in module._modules.values() if part is not None]
+    return modules
+
+
+def not_in_a_graph(networks: Sequence[BaseModel], optimizers: Sequence[th.optim.Optimizer]) -> str | None:
+    """Name what an update has beside the code of networks and the optimizers of PyTorch, as hooks: no graph would call it."""
+    if _has_any_global_hook():
+        return "hooks of all modules"
+    if _global_optimizer_pre_hooks or _global_optimizer_post_hooks:
+        return "hooks of all optimizers"
+    for optimizer in optimizers:
+        if optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
+            return f"hooks of the optimizer {type(optimizer).__name__}"
+        if "step" in vars(optimizer) or not inspect.unwrap(type(optimizer).step).__module__.startswith("torch.optim."):
+            return f"a step() that is not that of torch.optim ({type(optimizer).__name__})"
+    held = {id(parameter) for optimizer in optimizers for group in optimizer.param_groups for parameter in group["params"]}
+    for network, module in [(owner, part) for owner in networks for part in modules_of(owner)]:
+        if module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks:
+            return f"hooks of the network {type(module).__name__}"
+        if "forward" in vars(module):
+            return f"a forward() that was replaced ({type(module).__name__})"
+        for name, parameter in module._parameters.items():
+            if parameter is None or not parameter.requires_grad:
+                continue
+            if parameter._backward_hooks or parameter._post_accumulate_grad_hooks:
+                return f"hooks of the gradient of {name} ({type(module).__name__})"
+            # Target networks have no optimizer
+            if id(parameter) not in held and hasattr(network, "optimizer"):
+                return f"the gradient of {name} ({type(module).__name__}), which is in no optimizer of the model"
+    return None
 
 
 def actors_of(model: Any) -> list[Actor]:
@@ -154,6 +197,7 @@ class Graph:
         self._cuda_graph: th.cuda.CUDAGraph | None = None
         self._copies: list[th.Tensor] = []
         self._outputs: Sequence[th.Tensor] = ()
+        self.is_metrics_alone = False
 
     def __call__(self, *inputs: th.Tensor) -> Sequence[th.Tensor]:
         """As PyTorch calls it, after it has checked that the code is still that of the update."""
@@ -162,7 +206,9 @@ class Graph:
         self._inputs = [None if at in self._parts else each for at, each in enumerate(inputs)]
         # A number that is read from the processor would be the same in each replay
         self._on_gpu = self._on_gpu and all(each.is_cuda for each in inputs)
-        return self._run(inputs)
+        outputs = self._run(inputs)
+        self.is_metrics_alone = len(outputs) == 1
+        return outputs
 
     def again(self, sampled: Sequence[th.Tensor]) -> th.Tensor:
         """Run on other samples of the same form, without that check, and return the one output, the metrics."""
@@ -237,6 +283,7 @@ class CompiledUpdate:
         # One per group of parameters. A number would be a constant of the graph
         self._learning_rates: list[th.Tensor] = []
         self._space: spaces.Space = _NUMBERS
+        self._left_out: str | None = None
         # The parts of the samples at hand, and the code that PyTorch has chosen for them
         self._sampled: list[th.Tensor] = []
         self._graph: Graph | None = None
@@ -268,15 +315,21 @@ class CompiledUpdate:
     def ready(self, model: Any, optimizers: Sequence[th.optim.Optimizer]) -> Iterator[Callable[..., Metrics]]:
         """
         Have optimizers and networks in a form that can be compiled. All is as it was afterwards, so that models are saved as
-        without compilation.
+        without compilation. What a graph would leave out is looked for each time, and leads to the update as it is.
         """
         from torch import _dynamo as dynamo  # Takes seconds
 
         policy, space = model.policy, model.policy.observation_space
         networks = [network for network in policy.children() if isinstance(network, BaseModel)]
+        known, self._left_out = self._left_out, not_in_a_graph(networks, optimizers)
+        if self._left_out is not None:
+            if self._left_out != known:
+                warnings.warn(f"Updates are not compiled: a graph would leave out {self._left_out}.", stacklevel=3)
+            yield model._update
+            return
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]
         before = [group.copy() for group in groups]
-        if not self._learning_rates:
+        if len(self._learning_rates) != len(groups):
             if isinstance(space, spaces.Dict):
                 self._space = spaces.Dict(dict.fromkeys(space.spaces, _NUMBERS))
             self._learning_rates = [th.zeros((), device=model.device) for _ in groups]
@@ -305,7 +358,9 @@ class CompiledUpdate:
                 return names, graph.again(self._sampled)
             names, values = self._run(model, replay_data, costs, update_targets)
             assert self._graph is not None
-            checked[form] = self._graph, names
+            # Code that has made something beside the metrics, as a momentum at its first step, is that of one update
+            if self._graph.is_metrics_alone:
+                checked[form] = self._graph, names
             return names, values
 
         try:

@@ -97,11 +97,10 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self._check_arguments()
 
         super()._setup_model()
+        # A class of somebody else may store something else than the model observes
+        self._stored_spaces = spaces_of(self.replay_buffer)
         self._adopt_replay_buffer()
-        self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
-        # Running mean and running var
-        self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
-        self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+        self._create_aliases()
         # Target entropy is used when learning the entropy coefficient
         if self.target_entropy == "auto":
             # automatically set target entropy if needed
@@ -135,6 +134,12 @@ class CostAlgorithm(OffPolicyAlgorithm):
             self._compiled = CompiledUpdate(type(self)._update, self.device)
 
         self.raise_bound(0.0)
+
+    def _create_aliases(self) -> None:
+        self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
+        # Running mean and running var
+        self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
+        self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
 
     def _setup_lr_schedule(self) -> None:
         super()._setup_lr_schedule()
@@ -179,6 +184,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
     def _adopt_replay_buffer(self) -> None:
         """Let the replay buffer sample as the model says, or refuse it."""
+        for own, other in zip(self._stored_spaces, spaces_of(self.replay_buffer), strict=False):
+            if form_of(own) != form_of(other):
+                raise ValueError(f"The replay buffer is of another environment: it stores {other}, and the model needs {own}.")
         if isinstance(self.replay_buffer, NStepReplayBuffer):
             if self.gamma == 1:
                 raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns, for instance 0.99.")
@@ -230,6 +238,10 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self.policy.critic_target.offset.copy_(offset)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        self._adopt_replay_buffer()
+        n_envs = getattr(self.replay_buffer, "n_envs", self.n_envs)
+        if n_envs != self.n_envs:
+            raise ValueError(f"The replay buffer stores steps of {n_envs} environments, and the model has {self.n_envs}.")
         prepared = super()._setup_learn(*args, **kwargs)
         first = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         self._refuse_observation("first observation", first)
@@ -238,7 +250,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
     def _refuse_observation(self, name: str, value: Any) -> None:
         """Refuse one that is not finite, unless the features extractor is said to handle it."""
         if self.check_observations:
-            refuse_what_is_not_finite(f"environment gave the {name}", value, self.num_timesteps)
+            # VecNormalize learns nothing from the last ones
+            vec_normalize = None if name == "last observation" else self._vec_normalize_env
+            refuse_what_spoils_weights(f"environment gave the {name}", value, self.num_timesteps, vec_normalize)
 
     def _store_transition(
         self,
@@ -256,8 +270,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
             said, paid = vec_normalize.get_original_obs(), vec_normalize.get_original_reward()
         # An environment may pay a list
         paid = np.asarray(paid)
-        refuse_what_is_not_finite("policy gave the action", buffer_action, self.num_timesteps)
-        refuse_what_is_not_finite("environment gave the reward", paid, self.num_timesteps)
+        refuse_what_spoils_weights("policy gave the action", buffer_action, self.num_timesteps)
+        refuse_what_spoils_weights("environment gave the reward", paid, self.num_timesteps, vec_normalize)
         self._refuse_observation("observation", said)
         for index in np.flatnonzero(dones):
             self._refuse_observation("last observation", infos[index].get("terminal_observation"))
@@ -435,22 +449,40 @@ def warn_of_free_terminations(replay_buffer: ReplayBuffer | None, n_costs: float
     # A time limit is no termination, and some buffers cannot tell
     if not isinstance(replay_buffer, ReplayBuffer) or not replay_buffer.handle_timeout_termination:
         return
-    stored = slice(replay_buffer.size())
-    costs = 0.0 - replay_buffer.rewards[stored]
-    ends = (replay_buffer.dones[stored] > 0) & (replay_buffer.timeouts[stored] == 0)
+    # From the oldest step on
+    stored = (np.arange(replay_buffer.size()) + (replay_buffer.pos if replay_buffer.full else 0)) % replay_buffer.buffer_size
+    costs, done = 0.0 - replay_buffer.rewards[stored], replay_buffer.dones[stored] > 0
+    ends = done & (replay_buffer.timeouts[stored] == 0)
     if not ends.any() or ends.all():
         return
     others, last = costs[~ends], costs[ends].mean()
     price = others.mean() * n_costs
     # An end that costs less than any other step is a goal
     if others.min() <= last <= others.max() and price > 0:
+        # Of a buffer that is full the first episodes have lost their first steps
+        lengths = [np.diff(np.flatnonzero(column), prepend=-1)[int(replay_buffer.full) :] for column in done.T]
+        advice = advice_for_a_time_limit(np.concatenate(lengths)) or (
+            "Where the end is the goal, all is well. Where it is a failure, to fail early is the cheapest policy of any "
+            "algorithm: give the last step a cost of its own, above that of going on, here about "
+            f"{price:.3g} (what L is where each step has the mean cost)."
+        )
         warnings.warn(
             f"The last step before a termination costs {last:.3g} on average, no more than another step does (up to "
-            f"{others.max():.3g}). Where the end is the goal, all is well. Where it is a failure, to fail early is the "
-            "cheapest policy of any algorithm: give the last step a cost of its own, above that of going on, here about "
-            f"{price:.3g} (what L is where each step has the mean cost).",
+            f"{others.max():.3g}). {advice}",
             stacklevel=3,
         )
+
+
+def advice_for_a_time_limit(lengths: np.ndarray) -> str:
+    """Say what terminations of episodes of so many steps look like, if they are all alike, and otherwise nothing."""
+    if len(set(lengths)) != 1:
+        return ""
+    advice = (
+        f"All episodes that ended ({len(lengths)}) have {lengths[0]} steps, as with a time limit. If it is one, return "
+        "truncated=True at its end and not terminated=True, as gymnasium.wrappers.TimeLimit(env, max_episode_steps=...) does: "
+        "nothing has to be paid where the plant would go on."
+    )
+    return advice if len(lengths) > 1 else f"{advice} If it is a failure, its last step has to cost more than going on."
 
 
 def check_rate(name: str, rate: float | Schedule) -> None:
@@ -459,17 +491,29 @@ def check_rate(name: str, rate: float | Schedule) -> None:
         raise ValueError(f"{name}={rate} must start at a finite rate of at least 0.")
 
 
-def refuse_what_is_not_finite(name: str, value: Any, step: int) -> None:
-    """Raise a ``ValueError`` that names the number. One of them would spoil all weights."""
+def refuse_what_spoils_weights(name: str, value: Any, step: int, vec_normalize: VecNormalize | None = None) -> None:
+    """Raise a ``ValueError`` that names the number, if it is not finite, or has a square that float32 cannot hold."""
     if isinstance(value, dict):
         for key, part in value.items():
-            refuse_what_is_not_finite(f"{name} {key!r}", part, step)
-    elif value is not None and np.asarray(value).dtype.kind == "f" and not np.isfinite(value).all():
-        found = np.asarray(value)[~np.isfinite(value)].ravel()[0]
-        remedy = (
-            " A features extractor that handles such numbers needs check_observations=False." if "observation" in name else ""
+            refuse_what_spoils_weights(f"{name} {key!r}", part, step, vec_normalize)
+        return
+    numbers = np.asarray(value)
+    with np.errstate(over="ignore"):
+        sound = (
+            np.isfinite(np.square(numbers, dtype=np.float32, casting="same_kind")) if numbers.dtype.kind == "f" else np.True_
         )
-        raise ValueError(f"The {name} {found} at step {step}: all must be finite. See check_env().{remedy}")
+    if sound.all():
+        return
+    remedy, normalized = "Clip or replace it in a wrapper of the environment.", "norm_reward"
+    if "observation" in name:
+        remedy += " A features extractor that handles such numbers needs check_observations=False."
+        normalized = "norm_obs"
+    if vec_normalize is not None and vec_normalize.training and getattr(vec_normalize, normalized):
+        remedy += " The statistics of VecNormalize have it already: begin with new ones, or with those of an earlier file."
+    raise ValueError(
+        f"The {name} {numbers[~sound].ravel()[0]} at step {step}: all must be finite, and within +-1.8e19, whose square "
+        f"float32 holds. {remedy}"
+    )
 
 
 def refuse_samples(replay_data: Samples, step: int, check_observations: bool) -> None:
@@ -477,10 +521,22 @@ def refuse_samples(replay_data: Samples, step: int, check_observations: bool) ->
     names = ("actions", "rewards", "observations", "next_observations") if check_observations else ("actions", "rewards")
     named = [(name, getattr(replay_data, name)) for name in names]
     parts = [(name, part) for name, each in named for part in (each.values() if isinstance(each, dict) else [each])]
-    # One question for all: a sum is finite where all its terms are
-    if not math.isfinite(sum(part.sum() for _, part in parts if part.is_floating_point())):
+    # One question for all: a sum of squares is finite only where all of them are
+    if not math.isfinite(sum(part.float().square().sum() for _, part in parts if part.is_floating_point())):
         for name, part in parts:
-            refuse_what_is_not_finite(f"replay buffer gave {name} with", part.numpy(force=True), step)
+            refuse_what_spoils_weights(f"replay buffer gave {name} with", part.numpy(force=True), step)
+
+
+def spaces_of(replay_buffer: Any) -> list[spaces.Space]:
+    """The spaces of what a replay buffer stores, if it says them."""
+    return [getattr(replay_buffer, name) for name in ("observation_space", "action_space") if hasattr(replay_buffer, name)]
+
+
+def form_of(space: spaces.Space) -> Any:
+    """What arrays of a space have in common: whatever their limits, those of a box have one shape and one kind of numbers."""
+    if isinstance(space, spaces.Dict):
+        return {name: form_of(part) for name, part in space.spaces.items()}
+    return (space.shape, space.dtype.kind) if isinstance(space, spaces.Box) else space
 
 
 def reward_scale(vec_normalize: VecNormalize | None) -> float:

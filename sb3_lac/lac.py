@@ -86,9 +86,9 @@ class LAC(CostAlgorithm):
         reward is seen, or if ``None``, it is the largest one seen. ``gamma`` must be below 1 with a bound above 0.
     :param compile_update: Whether to compile each update to one graph (``torch.compile``), on a GPU a CUDA graph. It
         needs torch 2.11, and takes minutes at the first update and when a constant like ``batch_size`` has changed.
-        Leave it out where networks have forward hooks, which no graph calls.
-    :param check_observations: Whether to refuse an observation that is not finite. ``False`` is for a features extractor that
-        handles such numbers: NaN as a reading that is missing, inf as nothing in range.
+        Where there are hooks, or an optimizer with a ``step()`` of its own, updates are as without it, and a warning says so.
+    :param check_observations: Whether to refuse an observation that is not finite, or beyond 1.8e19. ``False`` is for a
+        features extractor that handles such numbers: NaN as a reading that is missing, inf as nothing in range.
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
         instead of action noise exploration (default: False)
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE
@@ -191,8 +191,6 @@ class LAC(CostAlgorithm):
             sde_sample_freq=sde_sample_freq,
             use_sde_at_warmup=use_sde_at_warmup,
         )
-        # Files name it. Those that do not are of before sb3_lac 0.7, when it was the fourth
-        self.policy_kwargs = {"root": 2, **self.policy_kwargs}
         if _init_setup_model:
             self._setup_model()
 
@@ -252,8 +250,7 @@ class LAC(CostAlgorithm):
         actor_loss = lambda_coef * objective + ent_coef * log_prob.mean()
 
         # Optimize the critic and the actor, both with the gradient at the current parameters
-        set_gradients(critic_loss, self.critic.optimizer)
-        set_gradients(actor_loss, self.actor.optimizer)
+        set_gradients((self.critic, critic_loss), (self.actor, actor_loss))
         step(self.critic.optimizer)
         step(self.actor.optimizer)
 

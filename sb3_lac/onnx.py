@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
@@ -20,11 +20,28 @@ from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 from torch.distributions import Distribution, Normal
 
 from sb3_lac.files import replacing
-from sb3_lac.vec_env import env_specs
+from sb3_lac.vec_env import env_specs, in_processes, wrappers_of
 
 if TYPE_CHECKING:
     from onnx import ModelProto
 
+# Where methods of wrappers are defined that hand on observations and actions as they are, or whose work is part of the file
+_HANDING_ON = (
+    *(
+        "gymnasium.core.Wrapper.",
+        "gymnasium.core.RewardWrapper.",
+        "sb3_lac.envs.drawing.",
+        "stable_baselines3.common.monitor.",
+    ),
+    *("gymnasium.vector.vector_env.VectorWrapper.", "gymnasium.vector.vector_env.VectorRewardWrapper."),
+    *(f"gymnasium.wrappers.{name}." for name in ("common", "rendering", "stateful_reward")),
+    *(f"gymnasium.wrappers.vector.{name}." for name in ("common", "rendering", "stateful_reward", "array_conversion")),
+    *(f"stable_baselines3.common.vec_env.vec_{name}." for name in ("check_nan", "monitor", "normalize", "transpose")),
+    *("stable_baselines3.common.vec_env.vec_video_recorder.", "stable_baselines3.common.vec_env.base_vec_env."),
+)
+# And those that hand on one of the two
+_HANDING_ON_ACTIONS = "gymnasium.core.ObservationWrapper.", "gymnasium.vector.vector_env.VectorObservationWrapper."
+_HANDING_ON_OBSERVATIONS = "gymnasium.core.ActionWrapper.", "gymnasium.vector.vector_env.VectorActionWrapper."
 #: What torch and onnxruntime may differ by in any action of the check, relative to the range of the actions
 TOLERANCE = 1e-5
 _N_CHECKED = 64
@@ -99,13 +116,15 @@ def export_onnx(
       export_onnx(model, "policy.onnx")
 
     Its input is ``observation`` and its output ``action``, both float32. The normalization of the observations by
-    ``VecNormalize`` and the scaling of the actions are included. Images are those of the policy, with the channels first. The
-    file is checked with onnxruntime before it takes its name, and ends with its checksum, which ``OnnxPolicy`` of battery_env
-    compares. Needs the extra ``sb3_lac[onnx]``.
+    ``VecNormalize`` and the scaling of the actions are included. Images are those of the policy, with the channels first. What
+    another wrapper does to observations and actions is left out. A warning and the metadata name it, input and output are then
+    ``observation_of_NormalizeObservation`` or ``action_of_RescaleAction``, and no environment is named. The file is checked
+    with onnxruntime before it takes its name, and ends with its checksum, which ``OnnxPolicy`` of battery_env compares. Needs
+    the extra ``sb3_lac[onnx]``.
 
     :param model: LAC, SAC, TD3, TQC, PPO, ... or a policy; or several models, of several seeds: the file has the mean of their
         actions
-    :param path: Of the file, which must not exist yet; ``.onnx`` is added where it is missing
+    :param path: Of the file; ``.onnx`` is added where it is missing. A file that this function wrote before is replaced.
     :param env_id: Id of the environment that the policy is for, kept in the file; by default that of the model's environment,
         where it is known
     :param vec_normalize: What normalizes the observations; by default the wrapper of the model's environment, if it has one. A
@@ -113,7 +132,7 @@ def export_onnx(
     :return: Path of the file
     :raises ValueError: If its spaces are not ``Box``, if it has a memory, if the file does not do what the policy does or
         takes one number of observations alone, or for models of several spaces
-    :raises FileExistsError: If the file exists
+    :raises FileExistsError: If there is another file
     :raises ImportError: Without the extra
     """
     try:
@@ -125,8 +144,8 @@ def export_onnx(
     path = Path(path)
     if path.suffix != ".onnx":
         path = path.with_name(path.name + ".onnx")
-    if path.exists():
-        raise FileExistsError(f"{path} exists: move it away, or give another path.")
+    if path.exists() and not _is_ours(path):
+        raise FileExistsError(f"{path} exists, and is not of export_onnx: move it away, or give another path.")
     models = list(model) if isinstance(model, Sequence) else [model]
     policies = [each if isinstance(each, BasePolicy) else each.policy for each in models]
     model, policy = models[0], policies[0]
@@ -139,23 +158,63 @@ def export_onnx(
     if "lstm_states" in inspect.signature(policy.forward).parameters:
         raise ValueError(f"{type(policy).__name__} has a memory: only policies of the observation alone have an ONNX export.")
     env = model.env if isinstance(model, BaseAlgorithm) else None
+    description, names = {"algorithm": type(model).__name__}, ["observation", "action"]
     if env is not None:
         vec_normalize = vec_normalize or unwrap_vec_normalize(env)
-        env_id = env_id or getattr(env_specs(env)[0], "id", None)
+        wrapped = [wrapper for wrapper in wrappers_of(env) if not _hands_on(wrapper, _HANDING_ON)]
+        left_out = ", ".join(type(wrapper).__name__ for wrapper in wrapped)
+        if wrapped:
+            description["wrappers"] = left_out
+            names = [_name("observation", wrapped, _HANDING_ON_OBSERVATIONS), _name("action", wrapped, _HANDING_ON_ACTIONS)]
+        else:
+            env_id = env_id or getattr(env_specs(env)[0], "id", None)
+            left_out = "those in its processes, if there are any" if in_processes(env) else ""
+        if left_out:
+            warnings.warn(
+                f"The file leaves out what wrappers of the environment do: {left_out}. Its input is {names[0]} and its output "
+                f"{names[1]}. Apply them around it, or train with VecNormalize, which becomes part of the file, and with the "
+                "actions of the plant.",
+                stacklevel=2,
+            )
     elif vec_normalize is None:
         warnings.warn(
             f"{type(model).__name__} has no environment that says whether observations were normalized, and is exported "
             "without. If they were, pass vec_normalize=VecNormalize.load(...), or load the model with its environment.",
             stacklevel=2,
         )
-    content = _checked_file(policies, vec_normalize, env_id, type(model).__name__)
+    if env_id is not None:
+        description["env_id"] = env_id
+    content = _checked_file(policies, vec_normalize, description, names)
     with replacing(path) as part:
         part.write_bytes(content)
     return path
 
 
+def _hands_on(wrapper: Any, places: tuple[str, ...]) -> bool:
+    """Whether all methods of a wrapper that observations and actions go through are defined in some of these places."""
+    names = ("reset", "step", "step_async", "step_wait")
+    methods = [getattr(type(wrapper), name) for name in names if hasattr(type(wrapper), name)]
+    return all(f"{method.__module__}.{method.__qualname__}".startswith(places) for method in methods)
+
+
+def _name(name: str, wrapped: Sequence[Any], places: tuple[str, ...]) -> str:
+    """The name of an input or output, which is that of the outermost wrapper that changes it."""
+    changing = [wrapper for wrapper in wrapped if not _hands_on(wrapper, _HANDING_ON + places)]
+    return f"{name}_of_{type(changing[0]).__name__}" if changing else name
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether the metadata of a file says that this package has written it."""
+    import onnx
+
+    try:
+        return "sb3_lac" in {entry.key for entry in onnx.load(path, load_external_data=False).metadata_props}
+    except Exception:  # protobuf has one for each kind of damage
+        return False
+
+
 def _checked_file(
-    policies: Sequence[BasePolicy], vec_normalize: VecNormalize | None, env_id: str | None, algorithm: str
+    policies: Sequence[BasePolicy], vec_normalize: VecNormalize | None, description: dict[str, str], names: Sequence[str]
 ) -> bytes:
     """Return the content of a file that does what the policies do, in the mean."""
     import onnxruntime
@@ -176,7 +235,7 @@ def _checked_file(
         observations = observations_to_check(policy.observation_space, vec_normalize)
         seen = observations if vec_normalize is None else vec_normalize.normalize_obs(observations)
         expected = np.mean([each.predict(seen, deterministic=True)[0] for each in policies], axis=0)
-        content = with_checksum(graph_of(module, observations[:_N_TRACED], env_id, algorithm).SerializeToString())
+        content = with_checksum(graph_of(module, observations[:_N_TRACED], description, names).SerializeToString())
     finally:
         for each, mode in zip(policies, was_training, strict=True):
             each.set_training_mode(mode)
@@ -184,7 +243,7 @@ def _checked_file(
     ranges = (module.high - module.low).cpu().numpy()
     for rows in (_N_CHECKED, 1):
         try:
-            (action,) = session.run(None, {"observation": observations[:rows]})
+            (action,) = session.run(None, {names[0]: observations[:rows]})
         except Exception as error:  # onnxruntime has one for each of its codes
             raise ValueError(
                 f"The exported policy was traced with {_N_TRACED} observations and does not take {rows}. Where a network has "
@@ -235,8 +294,10 @@ def with_checksum(content: bytes) -> bytes:
     return content + ModelProto(metadata_props=[entry]).SerializeToString()
 
 
-def graph_of(module: DeterministicPolicy, observations: np.ndarray, env_id: str | None, algorithm: str) -> ModelProto:
-    """Export a module, and describe it."""
+def graph_of(
+    module: DeterministicPolicy, observations: np.ndarray, description: dict[str, str], names: Sequence[str]
+) -> ModelProto:
+    """Export a module, with names of its input and its output, and describe it."""
     import onnx
 
     import sb3_lac
@@ -245,9 +306,11 @@ def graph_of(module: DeterministicPolicy, observations: np.ndarray, env_id: str 
         program = th.onnx.export(
             module,
             (th.as_tensor(observations, device=module.low.device),),
-            input_names=["observation"],
-            output_names=["action"],
+            input_names=[names[0]],
+            output_names=[names[1]],
             dynamic_shapes=({0: th.export.Dim("n")},),
+            # That of the exporter's own operators: a newer one is converted to, and needs a newer onnxruntime
+            opset_version=18,
             dynamo=True,
             verbose=False,
         )
@@ -256,8 +319,7 @@ def graph_of(module: DeterministicPolicy, observations: np.ndarray, env_id: str 
     # Where the code lies on this machine, for whoever gets the file
     for part in (graph.graph, *graph.graph.node, *(node for function in graph.functions for node in function.node)):
         part.ClearField("metadata_props")
-    description = {"algorithm": algorithm, "sb3_lac": sb3_lac.__version__}
-    if env_id is not None:
-        description["env_id"] = env_id
-    onnx.helper.set_model_props(graph, description)
+    # The oldest that knows the operators: an older onnxruntime loads the file
+    graph.ir_version = onnx.helper.find_min_ir_version_for(graph.opset_import, ignore_unknown=True)
+    onnx.helper.set_model_props(graph, {**description, "sb3_lac": sb3_lac.__version__})
     return graph

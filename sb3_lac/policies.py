@@ -17,6 +17,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
+#: Root of ``L`` that critics of ``LAC`` learn, unless another one is asked for.
+DEFAULT_ROOT = 2
+
 
 def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
     """The conservative one of several critics."""
@@ -87,6 +90,13 @@ class LyapunovCritic(BaseModel):
             self.add_module(f"lf{idx}", lyapunov_net)
             self.lyapunov_networks.append(lyapunov_net)
 
+    def __getattr__(self, name: str) -> Any:
+        if name == "q_networks":
+            raise AttributeError(
+                "A critic of costs has lyapunov_networks and no q_networks: the largest of their values counts."
+            )
+        return super().__getattr__(name)
+
     def forward(self, obs: PyTorchObs, actions: th.Tensor, as_values: bool = True) -> tuple[th.Tensor, ...]:
         """
         Get the values ``L(s, a)``, none of them negative, or what the networks give. An update of LAC asks for the latter:
@@ -151,7 +161,7 @@ class SumOfSquaresCritic(LyapunovCritic):
 class RootCritic(LyapunovCritic):
     """
     Lyapunov critic of ``LAC``: each network learns a root ``f(s, a)`` of what ``L`` is above its floor, about the value of the
-    loop at rest: ``L = offset + floor + sign(f) |f|^root``. Files that name no root are of before sb3_lac 0.7: the fourth.
+    loop at rest: ``L = offset + floor + sign(f) |f|^root``.
 
     Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` is a thousand times larger at a
     thousand times the cost, and one of a square root 32 times, of a fourth root less than six times. The unit of the costs is
@@ -164,14 +174,27 @@ class RootCritic(LyapunovCritic):
 
     n_outputs = 1
 
-    def __init__(self, *args: Any, root: int = 4, **kwargs: Any):
-        if root not in (2, 4):
+    def __init__(self, *args: Any, root: int | None = None, **kwargs: Any):
+        if root not in (None, 2, 4):
             raise ValueError(f"root={root} must be 2, of the square root, or 4, of the fourth root.")
         super().__init__(*args, **kwargs)
-        self.degree = root
+        self._stated_root = root
+        self.degree = DEFAULT_ROOT if root is None else root
         # What all values have in common. Set by the algorithm, saved with the weights
         self.floor: th.Tensor
         self.register_buffer("floor", th.zeros(1))
+
+    def get_extra_state(self) -> th.Tensor:
+        """Weights are of one root, which goes with them into files."""
+        return th.tensor(self.degree)
+
+    def set_extra_state(self, state: th.Tensor) -> None:
+        self.degree = int(state)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        # Weights of before sb3_lac 0.7 go with no root: that of the arguments, which came later, or else the fourth
+        state_dict.setdefault(f"{prefix}_extra_state", th.tensor(self._stated_root or 4))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def root(self, values: th.Tensor) -> th.Tensor:
         """
@@ -220,7 +243,7 @@ class LyapunovPolicy(SACPolicy):
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule (could be constant)
     :param net_arch: The specification of the policy and Lyapunov networks.
-    :param root: Which root of ``L`` the critics learn, 2 (the default of ``LAC``) or 4. Small costs count more beside large
+    :param root: Which root of ``L`` the critics learn, 2 (the default) or 4. Small costs count more beside large
         ones to the fourth root; the square root has less bias where chance, or what no observation tells, decides on costs.
     :param kwargs: The other arguments of ``SACPolicy``: ``activation_fn``, ``use_sde``, ``log_std_init``, ``use_expln``,
         ``clip_mean``, ``features_extractor_class``, ``features_extractor_kwargs``, ``normalize_images``, ``optimizer_class``,

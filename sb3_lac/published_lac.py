@@ -150,6 +150,9 @@ class PublishedLAC(CostAlgorithm):
             self.replay_buffer_class = HorizonReplayBuffer if plain else self.replay_buffer_class
             self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "horizon": self.horizon}
         super()._setup_model()
+
+    def _create_aliases(self) -> None:
+        super()._create_aliases()
         self.actor_target = self.policy.actor_target
         self.batch_norm_stats += get_parameters_by_name(self.actor, ["running_"])
         self.batch_norm_stats_target += get_parameters_by_name(self.actor_target, ["running_"])
@@ -219,8 +222,7 @@ class PublishedLAC(CostAlgorithm):
         actor_loss = lambda_coef * violation + ent_coef * log_prob.mean()
 
         # Optimize the critic and the actor, both with the gradient at the current parameters
-        set_gradients(critic_loss, self.critic.optimizer)
-        set_gradients(actor_loss, self.actor.optimizer)
+        set_gradients((self.critic, critic_loss), (self.actor, actor_loss))
         step(self.critic.optimizer)
         step(self.actor.optimizer)
 

@@ -4,10 +4,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_util import is_wrapped
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 
@@ -66,6 +67,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         observations, rewards, terminated, truncated, batch = self.env.step(self.actions)
+        rewards, terminated, truncated = _copied(rewards), _copied(terminated), _copied(truncated)
         dones = np.logical_or(terminated, truncated)
         time_limits = np.logical_and(truncated, ~terminated)
         infos = _unbatched({**batch, "TimeLimit.truncated": time_limits}, self._all)
@@ -149,18 +151,34 @@ class GymnasiumVecEnv(VecEnv):
         return [envs is not None and is_wrapped(envs[n], wrapper_class) for n in self._get_indices(indices)]
 
 
-def env_specs(env: VecEnv) -> list[EnvSpec | None]:
-    """Gymnasium's specifications, where the environments run in this process."""
+def in_processes(env: VecEnv) -> bool:
+    """Tell whether each environment runs in a process of its own."""
     inner = env.unwrapped
-    in_processes = isinstance(inner, SubprocVecEnv) or (
+    return isinstance(inner, SubprocVecEnv) or (
         isinstance(inner, GymnasiumVecEnv) and isinstance(inner.env.unwrapped, gym.vector.AsyncVectorEnv)
     )
+
+
+def env_specs(env: VecEnv) -> list[EnvSpec | None]:
+    """Gymnasium's specifications, where the environments run in this process."""
     # A specification that cannot be pickled, as with a lambda as entry point, would end the process of its environment
-    if not in_processes:
+    if not in_processes(env):
         # A vector environment of somebody else may have no attributes
         with suppress(AttributeError, NotImplementedError):
             return env.get_attr("spec")
     return [None] * env.num_envs
+
+
+def wrappers_of(env: VecEnv) -> list[Any]:
+    """The wrappers of a vector environment and of its first single one in this process, the outermost first."""
+    wrappers: list[Any] = []
+    inner: Any = env
+    while True:
+        if isinstance(inner, (VecEnvWrapper, gym.Wrapper, gym.vector.VectorWrapper)):
+            wrappers.append(inner)
+        elif not isinstance(inner, (GymnasiumVecEnv, DummyVecEnv, gym.vector.SyncVectorEnv)):
+            return wrappers
+        inner = inner.venv if isinstance(inner, VecEnvWrapper) else inner.envs[0] if hasattr(inner, "envs") else inner.env
 
 
 def _unbatched(batch: dict[str, Any], rows: np.ndarray) -> list[dict[str, Any]]:
@@ -195,6 +213,12 @@ def _copied(observations: Any) -> Any:
     # The replay buffer is filled one step later: an environment that reuses its arrays must not change them meanwhile
     if isinstance(observations, dict):
         return {name: _copied(part) for name, part in observations.items()}
+    if isinstance(observations, th.Tensor):
+        raise ValueError(
+            "The vector environment returns tensors of torch, and Stable-Baselines3 takes arrays of numpy. Convert them: "
+            "GymnasiumVecEnv(gymnasium.wrappers.vector.ArrayConversion(env, env_xp=torch, target_xp=numpy)). It needs "
+            "pip install 'gymnasium[array-api]>=1.2'."
+        )
     return np.array(observations)
 
 

@@ -8,8 +8,8 @@ RL Zoo with LAC: training, continuing, hyperparameter search and evaluation from
   python -m sb3_lac.zoo enjoy --env Pendulum-v1 -f logs --no-render
   python -m sb3_lac.zoo optimize --env Pendulum-v1 --n-trials 50
 
-Options are those of the RL Zoo's modules of these names, with two other defaults: the algorithm is LAC, and the
-hyperparameters of ``train`` and ``optimize`` are those of ``find_config()``.
+Options are those of the RL Zoo's modules of these names, with three other defaults: the algorithm is LAC, its environment
+Pendulum-v1, and the hyperparameters of ``train`` and ``optimize`` are those of ``find_config()``.
 """
 
 import argparse
@@ -257,13 +257,14 @@ def main(args: Sequence[str] | None = None) -> None:
     # Only the options with another default are read here, the RL Zoo reads all of them from sys.argv
     defaults = argparse.ArgumentParser(prog=prog, add_help=False)
     defaults.add_argument("--algo", default="lac")
+    defaults.add_argument("--env")
     if trains:
-        defaults.add_argument("--env", default="CartPole-v1")
         defaults.add_argument("-conf", "--conf-file")
     known, options = defaults.parse_known_args(parsed.options)
-    options += ["--algo", known.algo]
+    # That of the RL Zoo has discrete actions
+    known.env = known.env or ("Pendulum-v1" if known.algo in ALGORITHMS else "CartPole-v1")
+    options += ["--algo", known.algo, "--env", known.env]
     if trains:
-        options += ["--env", known.env]
         # The RL Zoo says which algorithms there are
         with suppress(FileNotFoundError):
             options += ["--conf-file", known.conf_file or str(find_config(known.algo, known.env))]

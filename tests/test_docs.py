@@ -1,38 +1,22 @@
-"""The examples of the documentation run, the commands it names exist, and the guide keeps to its house style."""
+"""The examples of pages and docstrings run, and print what is shown."""
 
-import importlib.util
 import re
 import shlex
-from itertools import groupby
-from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from battery_env.__main__ import calibrate
 from battery_env.estimators.reasons import Doubt, Reason
 from battery_env.parameters import PARAMETER_NAMES
+from checks.pages import DOCS, PAGES, ROOT, blocks, docstring_examples
 from sb3_lac.stability import fitting
+from tests.sweeps import sweep
 
-ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
-PAGES = [
-    ROOT / "README.md",
-    *sorted(page for folder in ("", "environments", "reports") for page in (DOCS / folder).glob("*.md")),
-]
 # What an example needs that no installation for the tests has: it is skipped there.
 OPTIONAL = {"compare_with_pybop.py": ("pybop",)}
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-
-#: What an environment, a report, the reference or the changelog says has a form of its own; all other pages are the guide.
-OWN_FORM = {"index", "api", "architecture", "contributing", "changelog"}
-STYLED = ["README", *(f"docs/{page.stem}" for page in sorted(DOCS.glob("*.md")) if page.stem not in OWN_FORM)]
-REPORTS = sorted((DOCS / "reports").glob("*.md"))
-#: What the changelog tells, and nothing else: a page says what is.
-HISTORY = r"\b(before that version|earlier version|earlier update|once had|at first|used to be|no longer|by hand before)\b"
-
-
-def blocks(page, language):
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+OF_DOCSTRINGS = docstring_examples()
 
 
 def examples(page):
@@ -46,31 +30,6 @@ def examples(page):
         else:
             parts.append(block)
     return parts
-
-
-def prose(page):
-    """Sentences of a page: without code, tables, headings, pictures and comments; of links the text, of code one word."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    text = re.sub(r"<!--.*?-->|\$\$.*?\$\$", "", text, flags=re.DOTALL)
-    text = re.sub(r"`+[^`]*`+", "code", text)
-    text = re.sub(r"!\[[^\]]*\]\([^)]*\)", "", text)
-    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
-    paragraphs = []
-    for shown, lines in groupby(
-        text.splitlines(), lambda line: bool(line.strip()) and not re.match(r"\s*(\||#|:|>? ?\|)", line)
-    ):
-        if shown:
-            paragraphs += re.split(r"\n(?=\s*(?:[-*]|\d+\.) )", "\n".join(lines))
-    # the number of an item in a list says nothing
-    paragraphs = [re.sub(r"^\s*(?:[-*]|\d+\.) ", "", paragraph) for paragraph in paragraphs]
-    sentences = [sentence for paragraph in paragraphs for sentence in re.split(r"(?<=[.!?])[*_)\"]*\s+", paragraph)]
-    return [sentence for sentence in sentences if len(sentence.split()) > 1]
-
-
-def published(path):
-    """The rows of a published table, a line each, as cells."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
 
 
 def run_briefly(source, name, folder, monkeypatch):
@@ -156,121 +115,50 @@ def test_reasons_can_be_looked_up_by_their_own_words():
     assert named and not [words for words in named if not any(words in text for text in texts)]
 
 
-def test_the_first_screen_names_the_interval_that_the_tutorial_of_a_life_shows():
-    (shown,) = re.findall(r"end of discharge \(s\) +(\d+) +\d+ +(\d+)", (DOCS / "cell_life.md").read_text(encoding="utf-8"))
-    assert f"lies within {shown[0]} to {shown[1]} s" in (ROOT / "README.md").read_text(encoding="utf-8")
+def test_the_first_screen_names_the_interval_that_its_block_prints(capsys):
+    page = ROOT / "README.md"
+    (block,) = (block for block in blocks(page, "python") if "track_life" in block)
+    exec(compile(block, str(page), "exec"), {})
+    (shown,) = re.findall(r"end of discharge \(s\) +(\d+) +\d+ +(\d+)", capsys.readouterr().out)
+    assert f"lies within {shown[0]} to {shown[1]} s" in page.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_in_pages_exist(page):
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for line in "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines():
-        words = shlex.split(line, comments=True)
-        if words[:2] == ["python", "-m"] and words[2] != "pip":
-            assert importlib.util.find_spec(words[2]) is not None, line
-        elif words[:1] == ["make"]:
-            assert re.search(rf"^{words[1]}:", makefile, flags=re.MULTILINE), line
+#: Figures with numbers in their titles: the page that shows each, and what the command of the page writes.
+FIGURES = sweep(
+    ("first_discharge.png", "first_discharge.md", "results/B0005_100_voltage.png"),
+    ("own_cell.png", "own_cell.md", "my_cell_fit.png"),
+)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_between_pages_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
-        if "://" not in target:
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+def title_of(path):
+    with Image.open(path) as picture:
+        return picture.text["Title"]
 
 
-def test_every_published_table_is_in_the_list_of_all_tables():
-    page = (DOCS / "results/README.md").read_text(encoding="utf-8")
-    tables = sorted(path.relative_to(DOCS / "results").as_posix() for path in DOCS.glob("results/*/*.md"))
-    assert sorted(re.findall(r"\]\(([^)]+\.md)\)", page)) == tables
+@pytest.mark.parametrize(("figure", "page", "written"), FIGURES)
+def test_the_titles_of_a_figure_are_those_that_the_command_of_its_page_writes(figure, page, written, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = next(block for block in blocks(DOCS / page, "bash") if "battery-calibrate" in block).splitlines()[0]
+    calibrate(shlex.split(command, comments=True)[1:])
+    assert title_of(DOCS / "pictures" / figure) == title_of(written)
 
 
-def test_every_picture_is_on_a_page():
-    text = "".join(page.read_text(encoding="utf-8") for page in (*PAGES, *DOCS.glob("*/*.md")))
-    pictures = [path for suffix in ("png", "gif") for path in DOCS.glob(f"*/**/*.{suffix}") if "_build" not in path.parts]
-    unused = [path.relative_to(DOCS).as_posix() for path in pictures if path.relative_to(DOCS).as_posix() not in text]
-    assert pictures and not unused
+@pytest.mark.attacks
+def test_runs_of_another_page_do_not_disturb_the_comparison_of_runs(tmp_path, monkeypatch):
+    for name in ("judge_any_loop.md", "tensorboard.md"):
+        for source in examples(DOCS / name):
+            run_briefly(source, name, tmp_path, monkeypatch)
+    assert {path.name for path in (tmp_path / "bands").iterdir()} == {"LAC", "PublishedLAC", "SAC", "TD3"}
 
 
-@pytest.mark.parametrize("name", STYLED)
-def test_a_page_of_the_guide_keeps_to_the_house_style(name):
-    page = ROOT / f"{name}.md"
-    text = page.read_text(encoding="utf-8")
-    sentences = prose(page)
-    words = [word for sentence in sentences for word in sentence.split()]
-    numbers = sum(bool(re.match(r"[-+±(]?\d", word)) for word in words)
-    assert len(text.splitlines()) < 150
-    assert len(words) / len(sentences) < 22, max(sentences, key=lambda sentence: len(sentence.split()))
-    assert numbers < 3 + 0.03 * len(words), f"{numbers} numbers in {len(words)} words: a table says more"
-    assert not (found := re.search(HISTORY, text)), found
+def tried_of_docstrings():
+    """Whole examples of docstrings. Those that train are tried with the attacks, but for that of LAC."""
+    for name, example in OF_DOCSTRINGS.items():
+        if "import " in example:
+            trains = ".learn(" in example and name != "sb3_lac.LAC"
+            yield pytest.param(name, marks=pytest.mark.attacks if trains else ())
 
 
-@pytest.mark.parametrize("page", [ROOT / f"{name}.md" for name in STYLED] + REPORTS, ids=lambda page: page.name)
-def test_every_picture_has_a_caption(page):
-    for picture in re.findall(r"^!\[.*\n\n?(?!\n?\*)", page.read_text(encoding="utf-8"), flags=re.MULTILINE):
-        pytest.fail(f"a line in italics has to follow {picture.strip()}: what to see, who made it, how many seeds")
-
-
-@pytest.mark.parametrize("name", STYLED)
-def test_tables_and_code_of_the_guide_fit_the_column_of_the_site(name):
-    wide = [line for block in blocks(ROOT / f"{name}.md", "python") for line in block.splitlines() if len(line) > 97]
-    assert not wide
-    for row in published(ROOT / f"{name}.md"):
-        assert len(row) <= 6, row
-        for cell in row:
-            words = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", cell).split()
-            assert len(words) <= 25, f"{len(words)} words: {cell}"
-
-
-def test_reports_are_short_enough_to_be_read():
-    words = 0
-    for page in REPORTS:
-        words += sum(len(sentence.split()) for sentence in prose(page))
-        words += sum(len(cell.split()) for row in published(page) for cell in row if not re.fullmatch(":?-+:?", cell))
-    assert words < 12_000
-
-
-@pytest.mark.parametrize("page", REPORTS, ids=lambda page: page.name)
-def test_a_report_answers_before_it_details(page):
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    assert re.findall(r"^## (.*)", text, flags=re.MULTILINE) == ["Question", "Answer", "How to repeat it", "Details"]
-    answer = text[text.index("## Answer") : text.index("## How to repeat it")]
-    assert answer.count("\n![") == 1 and answer.count("\n\n|") == 1
-
-
-#: Pages that say who is better: each names the rows that it rests on, ``<!-- rests on TABLE: cells of a row; value -->``.
-CLAIMING = ("README", "docs/when_to_take_lac", "docs/results_at_a_glance", "docs/faq", "docs/pretrained")
-
-
-@pytest.mark.parametrize("name", CLAIMING)
-def test_a_claim_of_the_guide_names_the_rows_that_it_rests_on(name):
-    text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
-    named = re.split(r"<!-- rests on ([^:\s]+): ([^>]+) -->", text)
-    # what is said is the paragraph before
-    claims = [(said.rpartition("\n\n")[2], *row) for said, *row in zip(named[:-1:3], named[1::3], named[2::3], strict=True)]
-    assert claims
-    for said, source, cells in claims:
-        *keys, value = cells.split("; ")
-        of_keys = [row for row in published(ROOT / source) if set(keys) <= set(row)]
-        assert any(
-            value in {part for cell in row for part in (cell, *cell.split(" / "), *cell.split(" "))} for row in of_keys
-        ), cells
-        assert re.search(rf"(?<![\d.]){re.escape(value)}(?![\d])", said), f"{value} is not said where {source} is named"
-
-
-@pytest.mark.parametrize("page", [ROOT / f"{name}.md" for name in STYLED] + REPORTS, ids=lambda page: page.name)
-def test_a_table_that_names_its_source_holds_what_was_published(page):
-    tables = re.findall(r"<!-- from ([^>]+) -->\n\n((?:\|.*\n)+)", page.read_text(encoding="utf-8"))
-    for source, table in tables:
-        rows = [row for name in source.split() for row in published(ROOT / name)]
-        header, _, *lines = ([cell.strip(" *`") for cell in line.strip().strip("|").split("|")] for line in table.splitlines())
-        for key, *cells in lines:
-            keys = [key, *(cell for cell in cells if re.match("[a-zA-Z]", cell))]
-            of_key = [row for row in rows if set(keys) <= set(row)]
-            assert of_key, f"{source} has no row of {keys}"
-            for name, cell in zip(header[1:], cells, strict=True):
-                of_cell = [row for row in of_key if name in row] or of_key
-                values = {
-                    value for row in of_cell for value in (*row, *(part for whole in row for part in whole.split(" ")[:1]))
-                }
-                assert not cell or cell in values, f"{source} has no {cell!r} of {key}, {name}"
+@pytest.mark.parametrize("name", [*tried_of_docstrings()])
+def test_whole_examples_of_docstrings_run(name, tmp_path, monkeypatch):
+    run_briefly(OF_DOCSTRINGS[name], name, tmp_path, monkeypatch)

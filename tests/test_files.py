@@ -202,8 +202,8 @@ def test_a_state_that_was_changed_is_refused_whole(streamed, tmp_path):
 def test_a_state_of_another_version_is_refused(streamed, tmp_path, monkeypatch):
     estimator, make = streamed
     file = estimator.save(tmp_path / "state")
-    monkeypatch.setattr("battery_env.estimators.state_files.FORMAT_VERSION", 10)
-    with pytest.raises(ValueError, match="state has format 9, this version reads 10: begin a discharge anew"):
+    monkeypatch.setattr("battery_env.estimators.state_files.FORMAT_VERSION", 11)
+    with pytest.raises(ValueError, match="state has format 10, this version reads 11: begin a discharge anew"):
         make().load(file)
 
 

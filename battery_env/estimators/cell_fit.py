@@ -21,6 +21,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.verdict import MISMATCH_MARGIN
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE
+from battery_env.records import ChargeBefore, DischargeStart
 
 #: How well the constants that say how fast a cell follows its load are known before any data, as standard deviations of their
 #: logarithms: kn of seven cells lies so far from a new one's, but for the one of NASA's that is reported.
@@ -117,6 +118,8 @@ class CellFit:
     :param thermal: whether the temperature of the model moves
     :param constants: what the discharges say about each constant
     :param discharges: the discharges
+    :param usual_start: how these start, which is full for this cell; ``None``: not alike, or in files of fits that were made
+        without it
     :raises TypeError: for a value of another kind
     :raises ValueError: for errors that are not positive, and numbers that are not finite
     """
@@ -128,6 +131,7 @@ class CellFit:
     thermal: bool
     constants: tuple[FittedConstant, ...]
     discharges: tuple[FittedDischarge, ...]
+    usual_start: DischargeStart | None = None
 
     def __post_init__(self) -> None:
         for name in ("cell", "start"):
@@ -145,6 +149,9 @@ class CellFit:
             _, *numbers = (value for item, value in vars(row).items() if (item, value) not in absent)
             if not isinstance(row.name, str) or not np.isfinite(check_numbers(row.name, numbers)).all():
                 raise ValueError(f"constants and discharges have names and finite numbers, got {row!r}")
+        start = [] if self.usual_start is None else [*self.usual_start[:3], *(self.usual_start.charge or ())]
+        if not np.isfinite(check_numbers("usual_start", start)).all():
+            raise ValueError(f"usual_start has finite numbers, got {self.usual_start!r}")
 
     @property
     def full_V(self) -> float:
@@ -210,6 +217,7 @@ class CellFit:
             "mismatch_V": self.mismatch_V,
             "q_mobile_bounds_C": self.q_mobile_bounds_C,
             "nuisance": self.rates_sd,
+            "usual_start": self.usual_start,
         }
         return LeastSquares(**{**own, **arguments})
 
@@ -291,6 +299,9 @@ class CellFit:
                 content[name] = CellParameters.of_mapping(content[name])
             for name, row in (("constants", FittedConstant), ("discharges", FittedDischarge)):
                 content[name] = tuple(row(**fields) for fields in content[name])
+            if content.get("usual_start") is not None:
+                *first, charge = content["usual_start"]
+                content["usual_start"] = DischargeStart._make([*first, charge and ChargeBefore._make(charge)])
             return cls(**content)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged, or no fit saved by CellFit.to_json: {error}") from error

@@ -29,7 +29,7 @@ from battery_env.estimators.cell_fit import (
     unseen_of_life,
 )
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V
-from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, BELOW_REST_V
+from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, BELOW_REST_V, usual_start
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, spread_over, square
 from battery_env.parameters import Q_MOBILE, R_O
@@ -116,7 +116,7 @@ def fit_cell(
     # a simulated record is at rest before its first current acts
     at_rest = [not isinstance(whole, Discharge) or whole.load.first > 0 for whole in discharges]
     _check_starts_alike(records, at_rest)
-    fit = JointFit(records, at_rest, prior, thermal, dt_s).solve()
+    fit = replace(JointFit(records, at_rest, prior, thermal, dt_s).solve(), usual_start=usual_start(records))
     if not fit.rmse_V <= limit_V:
         raise ValueError(
             f"the equations do not describe this cell: with all constants fitted the voltage is still {1e3 * fit.rmse_V:.0f} "

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES, AgingPath
@@ -17,13 +18,14 @@ from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_er
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimators.diagnosis.evidence import dropouts_s, evidence_of, measured, unseen_C
+from battery_env.estimators.diagnosis.faults import MOST_NOISE_SD
+from battery_env.estimators.diagnosis.knee import knee_sd_C
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.reasons import Reason
 from battery_env.estimators.search import MARGIN, Fit, JointPrior, Prior, Search, root_inverse_diagonal, square
 from battery_env.estimators.verdict import (
-    MOST_NOISE_SD,
     PRIOR_LIMIT_SD,
     SPARE_SAMPLES,
     Assumptions,
@@ -34,7 +36,7 @@ from battery_env.estimators.verdict import (
     white_noise_V,
 )
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
-from battery_env.records import ChargeHistory, Record, Samples, check_record, drawn_charge_C, history_of
+from battery_env.records import ChargeHistory, DischargeStart, Record, Samples, check_record, drawn_charge_C, history_of
 from battery_env.records.model import RecordModel
 
 # Noise told from residuals is not below the resolution of a voltmeter, V.
@@ -61,7 +63,8 @@ class _Fitted:
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.search.parameters, root_inverse_diagonal(fit.jacobian), strict=False):
             ratio = ratios.get(name, 1.0) * (fit.spread if name == "q_mobile" else 1.0)
-            sd[name] = hypot(ratio * sqrt(self.variance) * float(root), self.hidden_sd[name])
+            knee_sd_C = fit.knee_sd_C if name == "q_mobile" else 0.0
+            sd[name] = hypot(ratio * sqrt(self.variance) * float(root), self.hidden_sd[name], knee_sd_C)
         return sd
 
 
@@ -120,6 +123,8 @@ class LeastSquares(Estimator):
         to those of the parameters. :func:`battery_env.soc_from_rest` tells it from the voltage of the rest before the load
     :param path: how cells of this kind age (:func:`battery_env.fit_life`): which constants, ``q_mobile`` and ``r_o`` go
         together before this record is seen. ``cell`` and ``mismatch_V`` are those of the path by default
+    :param usual_start: how other discharges of the cell start, which the record is compared with; ``None``: as a full cell of
+        the model rests
     :raises ValueError: for an argument out of range
     """
 
@@ -140,10 +145,11 @@ class LeastSquares(Estimator):
         nuisance: Mapping[str, float] | None = None,
         initial_soc: InitialSoc = 1.0,
         path: AgingPath | None = None,
+        usual_start: DischargeStart | None = None,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
-        self.path = path
+        self.path, self.usual_start = path, usual_start
         # so many times larger than the fit says are standard deviations, but for that of a prior
         self._sd_ratio = 1.0 if path is None else path.sd_ratio
         if path is not None:
@@ -213,7 +219,7 @@ class LeastSquares(Estimator):
 
     def _history(self, record: Record) -> ChargeHistory:
         # where another charge is stated, that before the load does not count
-        history = history_of(record)
+        history = history_of(record, self.usual_start)
         return history if self.initial_soc[0] == 1.0 else history._replace(charge=None)
 
     def _estimate(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> Estimate:
@@ -261,7 +267,10 @@ class LeastSquares(Estimator):
         alone = fit = search.best(starts, priors)
         variance = 1.0 if noise_V else square(alone.residual_V) / (len(alone.residual_V) - len(self.parameters))
         if "q_mobile" in self.parameters:
-            alone = fit = replace(alone, spread=search.spread(alone, priors, variance))
+            # a model that is exact, or of cells of this kind, has no other knee
+            is_sure = error.drift_V == 0.0
+            knee_C = 0.0 if is_sure else knee_sd_C(record, _model_V(record, alone), self.model.cell.VEOD)
+            alone = fit = replace(alone, spread=search.spread(alone, priors, variance), knee_sd_C=knee_C)
         if self.path is not None:
             # what goes together along the path is a prior of q_mobile too, on which a settled estimate must not rest
             loose = np.pad(np.diag(1.0 / np.array(list(self.nuisance.values()))), ((0, 0), (len(self.parameters), 0)))
@@ -278,11 +287,9 @@ class LeastSquares(Estimator):
         return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, unseen_C(evidence)), evidence)
 
     def _evidence(self, record: Samples, history: ChargeHistory, fit: Fit) -> Any:
-        """What the samples of a record show, with a fit, whose model may be empty before they end."""
-        model_V = np.full(len(record.time_s), nan)
-        model_V[: len(fit.residual_V)] = record.voltage_V[: len(fit.residual_V)] + fit.residual_V
-        estimate = [fit.values[name] for name in PARAMETER_NAMES]
-        return evidence_of(record, self.model.cell, self.initial_soc[0] if self._at_rest else None, estimate, history, model_V)
+        """What the samples of a record show, with a fit."""
+        estimate, soc = [fit.values[name] for name in PARAMETER_NAMES], self.initial_soc[0] if self._at_rest else None
+        return evidence_of(record, self.model.cell, soc, estimate, history, _model_V(record, fit))
 
     def _hidden_sd(self, search: Search, fit: Fit, unseen_C: float) -> dict[str, float]:
         """
@@ -333,11 +340,18 @@ class LeastSquares(Estimator):
         for name in fit.at_bound:
             diagnosis.note_about(name, Reason.AT_BOUND)
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
-        known = Assumptions(self.current_gain_sd, sd_soc / soc, is_along_path=self.path is not None)
+        known = Assumptions(self.current_gain_sd, sd_soc / soc, knee_sd_C=alone.knee_sd_C, is_along_path=self.path is not None)
         # where the record has it and where a prior has moved it: beside its knee the voltage says little of q_mobile
         moved_there = replace(alone, jacobian=np.vstack([fit.jacobian[:n], alone.jacobian[n:]]))
         own_sds = [fitted.sd(each, {"q_mobile": self._sd_ratio}) for each in (alone, moved_there)]
         return diagnosis.verdict(alone.values, {name: max(sd[name] for sd in own_sds) for name in free}, free, priors, known)
+
+
+def _model_V(record: Samples, fit: Fit) -> FloatArray:
+    """What the model of a fit gives at the samples of a record, NaN where it is empty."""
+    model_V = np.full(len(record.time_s), nan)
+    model_V[: len(fit.residual_V)] = record.voltage_V[: len(fit.residual_V)] + fit.residual_V
+    return model_V
 
 
 def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) -> dict[str, float]:

@@ -85,6 +85,10 @@ class Doubt(_Row):
         "on. Correct the times if the clock jumped, or give a rest as samples of no current."
     )
     CONSTANTS = "the discharges that the constants were fitted to leave it open. Fit such of other loads, or with pauses, too."
+    KNEE = (
+        "where the record ends, its voltage falls less steeply than that of the model. The knee of this cell may come later. "
+        "Discharge further, or fit constants to this cell (fit_cell, --cell)."
+    )
     POLICY = "the policy is so far from the fit in its observation, which it does not trust. Use least squares."
 
 
@@ -111,6 +115,11 @@ class Reason(_Row):
         "The record starts at {first_V:.2f} V under {first_A:.3g} A, where {expected} at rest shows {rest_V:.2f} V: it has "
         "not rested, holds another charge, or is another kind of cell. Give the whole discharge of a full cell with a minute "
         "at rest before it, state initial_soc (--initial-soc), or fit constants to such cells (fit_cell, --cell)."
+    )
+    START_UNLIKE = (
+        "The record starts at {first_V:.2f} V under {first_A:.3g} A, where the discharges of its life, or of its fit, do at "
+        "{rest_V:.2f} V under {usual_A:.3g} A: it was charged or has rested otherwise, or is of another cell. Give one that "
+        "starts as they do, or state initial_soc (--initial-soc)."
     )
     OTHER_LOAD = (
         "The load, {load_A:.3g} A, is none of those that the constants were fitted to, {fitted} A, and they hold for these: "

@@ -155,6 +155,7 @@ class Fit:
     square: float  # of all residuals as they are weighed
     at_bound: tuple[str, ...]  # which parameters are
     spread: float = 1.0  # how many times as wide as its curvature says the likelihood of q_mobile is
+    knee_sd_C: float = 0.0  # of the charge that the record may give beyond the knee of its model
 
 
 @dataclass(frozen=True)
@@ -310,12 +311,13 @@ class Search:
 
         best = adjusted(fit.values)
         highest, ends_C = best[0], []
+        # upward a likelihood may be flat: steps grow with the distance to the least value, where that is more than a step
+        near_C = min(least_C, best_C - _STEP_SD * sd_C)
         for side in (-1, 1):
             (height, values), q_C = best, best_C
             for way_C in _STEP_SD * sd_C * np.arange(1, _STEPS):
                 before, before_C = height, q_C
-                # upward a likelihood may be flat: steps grow along with the distance to the least value
-                q_C = best_C - way_C if side < 0 else least_C + (best_C - least_C) * exp(way_C / (best_C - least_C))
+                q_C = best_C - way_C if side < 0 else near_C + (best_C - near_C) * exp(way_C / (best_C - near_C))
                 bounds_C = self._bounds_at(values)["q_mobile"]
                 if _within(q_C, bounds_C) != q_C:
                     q_C = _within(q_C, bounds_C)

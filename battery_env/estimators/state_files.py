@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from battery_env.files import replacing
 
-FORMAT_VERSION = 9
+FORMAT_VERSION = 10
 # A file is a line of JSON that begins like this, arrays as numpy writes them, and the SHA-256 of both.
 _BEGINNING = '{"kind": "state of an estimator"'
 _DIGEST_SIZE = sha256().digest_size

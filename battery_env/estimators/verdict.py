@@ -29,8 +29,6 @@ from battery_env.parameters import PARAMETER_NAMES
 PLAUSIBLE_Q_SHARES = (0.2, 5.0)
 #: The error of the model may be this much larger than stated before the residuals contradict it.
 MISMATCH_MARGIN = 2.0
-#: A voltage farther off than so many standard deviations of its noise shows an error of the model, or of the sensor.
-MOST_NOISE_SD = 3.0
 #: So many samples more than parameters tell how large the noise is.
 SPARE_SAMPLES = 10
 #: A prior contradicts the record beyond so many standard deviations of their difference. Within it, a prior of the settled
@@ -60,6 +58,7 @@ class Assumptions(NamedTuple):
     gain_sd: float = 0.0  # of the current sensor, which scales both parameters
     sd_soc: float = 0.0  # of the charge at the start, as a share of it
     cell_sd_r_o: float = 0.0  # what the constants of the cell leave open of ``r_o``, ohm
+    knee_sd_C: float = 0.0  # of the charge beyond the knee of the model
     apart: tuple[float, float] = (0.0, 0.0)  # how far a policy is from the fit in its observation, C and ohm
     is_along_path: bool = False  # whether these constants lie along a path of aging cells
 
@@ -114,6 +113,7 @@ def judge(judged: Row, evidence: Row, known: Assumptions) -> None:
             else:
                 for number, size_C in enumerate(charges_in_doubt_C(evidence)):
                     _note_doubt(judged, 0, number + 1, size_C)
+                _note_doubt(judged, 0, Doubt.KNEE, known.knee_sd_C)
             _note_doubt(judged, k, Doubt.POLICY, known.apart[k])
             _note_one(judged, 1, Reason.PATH_UNTESTED, 1, not is_r_o and known.is_along_path)
             scale_sd = known.gain_sd if is_r_o else hypot(known.gain_sd, known.sd_soc)

@@ -539,7 +539,7 @@ def _outcome(known: Outcome, made: Attempt, results: Results | None) -> tuple[Ou
 
 def _voltages_of(name: str, found: Calibration) -> dict[str, bytes]:
     """What one discharge showed, beside the model, as CSV and as PNG."""
-    from battery_env.plotting import literal, plot_discharge  # here, as matplotlib takes long to import
+    from battery_env.plotting import literal, plot_discharge, titles_of  # here, as matplotlib takes long to import
 
     record, forecast = found.record, found.forecast
     assert record is not None and forecast is not None
@@ -547,5 +547,6 @@ def _voltages_of(name: str, found: Calibration) -> dict[str, bytes]:
     table = pd.DataFrame(columns | {"model_V": forecast.at_samples_V}).to_csv(index=False).encode()
     picture = io.BytesIO()
     models = {f"model, {METHOD_NAMES[found.method]}": forecast}
-    plot_discharge(record, models, title_of(literal(name), found)).savefig(picture, dpi="figure")
+    figure = plot_discharge(record, models, title_of(literal(name), found))
+    figure.savefig(picture, dpi="figure", metadata=titles_of(figure))
     return {"csv": table, "png": picture.getvalue()}

@@ -140,21 +140,21 @@ def calibrated(
     :param samples: of what may come
     :param end_is_asked: whether an end that cannot be told is an error, and not only unknown
     """
-    is_whole = not np.isnan(discharge.eod_time_s(settings.cut_off_V))
+    is_whole = not np.isnan(discharge.eod_time_s(settings.resolved.cut_off_V))
     known = settings if is_whole else settings.with_nominal_prior()
     part = _look_at(discharge, known)
     if end_is_asked and _is_below_all_sizes(part):
         raise ValueError(_below_all_sizes())
     estimate, method, model, now = _estimate(part, known, load)
     # a cell in progress has not ended, however low its model comes in the pulses before
-    cut_off_V, current_A = (-np.inf, 0.0) if part.in_progress else (settings.cut_off_V, part.load.mean_A)
+    cut_off_V, current_A = (-np.inf, 0.0) if part.in_progress else (settings.resolved.cut_off_V, part.load.mean_A)
     shown = model.forecast(part.record, estimate, cut_off_V, current_A)
     sized = _of_its_size(estimate, settings, float(part.loaded.charge_C))
     end = None
     if end_is_asked or np.isfinite(sized.q_mobile):  # what has no size has no end
         end = _end(part, estimate, replace(known, method=method), now or model, shown, load, samples, end_is_asked)
     charge = _charge(part, settings, estimate, end)
-    if part.start.reason or part.more_C or not _is_all_logged(part, shown, estimate):
+    if part.start.reason or part.more_C or not _is_all_logged(part, known, shown, estimate):
         charge = dict.fromkeys(charge, float("nan"))
     nominal_Ah = _nominal_Ah(model, settings, part.load.mean_A)
     eod_s, sd_eod_s = (shown.eod_time_s, float("nan")) if end is None else _middle(end.eod_time_s, estimate)
@@ -194,17 +194,17 @@ def calibrated(
 
 def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
     """The part under load, how it starts, and what comes after it."""
-    loaded, eod_time_s = discharge.loaded_part(settings.cut_off_V), discharge.eod_time_s(settings.cut_off_V)
-    more_C = _charge_after(discharge, loaded, eod_time_s, settings.cut_off_V)
+    loaded, eod_time_s = discharge.loaded_part(settings.resolved.cut_off_V), discharge.eod_time_s(settings.resolved.cut_off_V)
+    more_C = _charge_after(discharge, loaded, eod_time_s, settings.resolved.cut_off_V)
     record = loaded
     if len(loaded.time_s) > _MANY_SAMPLES:
         record = loaded.averaged(max(_MODEL_STEP_S, float(loaded.time_s[-1] - loaded.time_s[0]) / _MANY_SAMPLES))
     cell, fitted = _cell_at_the_temperature(record, settings), record
-    if not settings.thermal:
+    if not settings.resolved.thermal:
         # one that is held counts more than one that was measured
         discharge, fitted = discharge.without_temperature(), record.without_temperature()
     if settings.initial_soc == "rest":
-        start = soc_from_rest(discharge, cell, settings.mismatch_V)
+        start = soc_from_rest(discharge, cell, settings.resolved.mismatch_V)
     else:
         soc, sd_soc = check_initial_soc(settings.initial_soc)
         start = Start(soc, sd_soc)
@@ -235,7 +235,7 @@ def _estimate(
     # before the knee least squares, of which all parameters are free then, take any large q_mobile for likely
     method = settings.method or ("kalman" if is_running and is_new else "least-squares")
     calibrator = replace(settings, method=method).calibrator(part.cell, part.start)
-    cell, thermal, now = part.cell, settings.thermal, None
+    cell, thermal, now = part.cell, settings.resolved.thermal, None
     if _is_below_all_sizes(part):
         estimate = _SMALLEST
     elif isinstance(calibrator, ExtendedKalmanFilter):
@@ -301,9 +301,9 @@ def _end(
             part.record,
             estimate,
             load,
-            settings.cut_off_V,
+            settings.resolved.cut_off_V,
             model=model,
-            mismatch_V=settings.mismatch_V,
+            mismatch_V=settings.resolved.mismatch_V,
             nominal_Ah=settings.nominal_Ah,
             samples=samples,
         )
@@ -311,7 +311,7 @@ def _end(
         if is_asked:
             raise
         return None
-    load_A = part.load.mean_A if load is None else _largest_A(load, settings.cut_off_V)
+    load_A = part.load.mean_A if load is None else _largest_A(load, settings.resolved.cut_off_V)
     # a cell of which nothing is known has no health
     is_known = settings.nominal_Ah is not None or settings.tells_new_capacity(load_A)
     notes = (*end.notes, *_notes(part, estimate, settings, shown, load_A))
@@ -328,7 +328,7 @@ def _notes(part: _LoadedPart, estimate: Estimate, settings: Settings, shown: Vol
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
     if settings.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
         yield "The filter expects a cell of some 2 Ah: of another one give the nominal capacity, the life, q_max or constants."
-    if rmse_V > settings.mismatch_V:
+    if rmse_V > settings.resolved.mismatch_V:
         text = f"The model misses the voltage by {1e3 * rmse_V:.0f} mV (RMSE), more than mismatch_V."
         yield f"{text} Other loads make the interval too narrow."
 
@@ -402,12 +402,13 @@ def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cu
     return more_C
 
 
-def _is_all_logged(part: _LoadedPart, forecast: VoltageForecast, estimate: Estimate) -> bool:
+def _is_all_logged(part: _LoadedPart, settings: Settings, forecast: VoltageForecast, estimate: Estimate) -> bool:
     """
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
-    record, history, parameters = Samples.of(part.record), history_of(part.record), (estimate.q_mobile, estimate.r_o)
+    record, parameters = Samples.of(part.record), (estimate.q_mobile, estimate.r_o)
+    history = history_of(part.record, settings.resolved.usual_start)
     shown = evidence_of(record, part.cell, part.start.soc, parameters, history, forecast.at_samples_V)
     # a charge that tapered off fills any cell, whatever its voltage at rest
     is_lower = shown["start"]["first_V"] < shown["start_V"] and not (history.charge and history.charge.tapered)
@@ -420,4 +421,4 @@ def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:
     if not load_A > 0.0 or not settings.tells_new_capacity(load_A):
         return float("nan")
     # the cell is empty by then
-    return float(model.capacity_Ah([constant(load_A, "current")], settings.cut_off_V)[0])
+    return float(model.capacity_Ah([constant(load_A, "current")], settings.resolved.cut_off_V)[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from math import exp, hypot, isnan, log, nan, sqrt
@@ -22,11 +23,12 @@ from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
+from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import is_only_imprecise
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome
-from battery_env.records import VARIED_SHARE, drawn, mean_current_A
+from battery_env.records import VARIED_SHARE, DischargeStart, drawn, drawn_charge_C, mean_current_A
 from battery_env.records.discharge import Discharge
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
@@ -55,6 +57,7 @@ class Life:
     :param state: mean of (ln ``q_mobile`` after the last discharge, drift), shape (2,)
     :param covariance: theirs, shape (2, 2)
     :param sd_share: standard deviation of the last valid ``q_mobile``, a share, with constants as unsure as they are; or NaN
+    :param usual_start: how the discharges start; ``None`` where they do not start and last alike
     """
 
     table: pd.DataFrame
@@ -64,6 +67,7 @@ class Life:
     state: FloatArray
     covariance: FloatArray
     sd_share: float = nan
+    usual_start: DischargeStart | None = None
 
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
@@ -120,7 +124,7 @@ class Life:
         """
         if not 1 <= check_whole_number("count", count) <= len(self.table):
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
-        return replace(life_of(self.table.iloc[:count]), sd_share=self.sd_share)
+        return replace(life_of(self.table.iloc[:count]), sd_share=self.sd_share, usual_start=self.usual_start)
 
     def remaining_discharges(self, threshold_Ah: float, probability: ArrayLike = BAND) -> FloatArray:
         """
@@ -192,7 +196,7 @@ def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
     unsure = known.calibrator()
     assert isinstance(held, LeastSquares)
     assert isinstance(unsure, LeastSquares)
-    return _track(discharges, settings.cut_off_V, held, unsure)
+    return _track(discharges, settings.resolved.cut_off_V, held, unsure)
 
 
 def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares, unsure: LeastSquares) -> Life:
@@ -203,6 +207,9 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
         raise ValueError("the calibrator must take discharges to start full: the charge to the cut-off is no capacity else")
     if not len(discharges):
         raise ValueError("discharges must hold at least one discharge")
+    usual_start = _usual_start(discharges, cut_off_V)
+    held, unsure = copy(held), copy(unsure)
+    held.usual_start = unsure.usual_start = usual_start or held.usual_start
     rows = []
     for position, discharge in enumerate(discharges):
         row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
@@ -213,7 +220,19 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
     life = life_of(pd.DataFrame(rows, columns=_COLUMNS))
     last = discharges[int(np.flatnonzero(life.table["valid"])[-1])]
     estimate = unsure.estimate(last.loaded_part(cut_off_V))
-    return replace(life, sd_share=estimate.sd_q_mobile / estimate.q_mobile)
+    return replace(life, sd_share=estimate.sd_q_mobile / estimate.q_mobile, usual_start=usual_start)
+
+
+def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> DischargeStart | None:
+    """How the discharges of a life start, if they start and last alike: others do not tell what is full."""
+    parts = []
+    for discharge in discharges:
+        with suppress(ValueError):  # of one that cannot be used
+            if not isnan(discharge.eod_time_s(cut_off_V)):
+                parts.append(discharge.loaded_part(cut_off_V))
+    alike = starting_alike(parts)
+    steps = np.abs(np.diff(np.log([drawn_charge_C(part) for part in alike])))
+    return usual_start(alike) if len(steps) and np.median(steps) <= VARIED_SHARE else None
 
 
 def _row_of(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> dict[str, Any]:

@@ -197,7 +197,7 @@ def show_end(chosen: Found, life: Life | None, settings: Settings) -> None:
     figure.add_scatter(y=end.voltage_V[0], showlegend=False, **edge)
     figure.add_scatter(y=end.voltage_V[2], fill="tonexty", fillcolor="rgba(76, 120, 168, 0.3)", name="voltage, 90 %", **edge)
     figure.add_scatter(x=edge["x"], y=end.voltage_V[1], line_color=qualitative.T10[0], mode="lines", name="voltage, median")
-    measured = whole.loaded_part(settings.cut_off_V)
+    measured = whole.loaded_part(settings.resolved.cut_off_V)
     figure.add_scatter(
         x=measured.time_s / 60.0, y=measured.voltage_V, line={"color": "#777777", "dash": "dot"}, name="measured"
     )

@@ -145,7 +145,7 @@ def text_of(name: str, found: Calibration) -> str:
         lines.append(f"calibrated by {_CALIBRATED_BY[found.method]}")
     lines.append("")
     for column, remark in _rows_of_text(found):
-        line = f"  {_HOW[column]['text'].format(found.settings):<22}{found.shown(column):>12}"
+        line = f"  {_HOW[column]['text'].format(found.settings.resolved):<22}{found.shown(column):>12}"
         lines.append(f"{line}   {remark}" if remark else line)
     if not found.settled:
         lines += ["", f"{_HOW['reason']['text']}: {found.reason}"]
@@ -176,7 +176,7 @@ def _rows_of_text(found: Calibration) -> Iterator[tuple[str, str]]:
 
 
 def _of_the_charge(found: Calibration) -> str:
-    cut_off = f"{found.settings.cut_off_V:g} V"
+    cut_off = f"{found.settings.resolved.cut_off_V:g} V"
     if found.in_progress:
         return "so far"
     if np.isnan(found.predicted_capacity_Ah):

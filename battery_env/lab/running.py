@@ -210,9 +210,13 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
 
 
 def _known_before(running: Discharge, settings: Settings, load: LoadToCome | None, life: Life | None) -> Settings:
-    """With the prior of a life. Constants of unstated doubt are held where they carry over: from a life, to another load."""
+    """
+    With the prior and the start of a life. Constants of unstated doubt are held where they carry over: from a life, to another
+    load.
+    """
     if life is not None:
-        settings = replace(settings, prior_q_mobile_C=life.prior_for(running, load))
+        start = life.usual_start or settings.usual_start
+        settings = replace(settings, prior_q_mobile_C=life.prior_for(running, load), usual_start=start)
     is_held = settings.prior_q_mobile_C is not None and (life is not None or load is not None)
     return replace(settings, cell_rates_sd=settings.cell_rates_sd or {}) if is_held else settings
 
@@ -240,7 +244,7 @@ def end_of_record(
     found = calibrated(running, _known_before(running, settings, to_come, past), to_come, end_is_asked=True)
     if not found.in_progress:
         raise ValueError(
-            f"{argument} reaches {settings.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is left to "
-            "forecast: calibrate it, or give a lower --cut-off"
+            f"{argument} reaches {settings.resolved.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is "
+            "left to forecast: calibrate it, or give a lower --cut-off"
         )
     return End(record_name(source.stem, source.cycle), found, past)

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import Reason
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
-from battery_env.records import CUT_OFF_V
+from battery_env.records import CUT_OFF_V, DischargeStart
 
 Method = Literal["least-squares", "kalman", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -45,13 +45,24 @@ class SettingsOptions(TypedDict, total=False):
     cell: CellFit | AgingPath | CellParameters | None
     cell_rates_sd: Mapping[str, float] | None
     initial_soc: InitialSoc | Literal["rest"]
+    usual_start: DischargeStart | None
+
+
+class ResolvedSettings(NamedTuple):
+    """What the cell tells of :class:`Settings` where nothing is stated: the names are theirs."""
+
+    cut_off_V: float
+    mismatch_V: float
+    thermal: bool
+    usual_start: DischargeStart | None
 
 
 @dataclass(frozen=True)
 class Settings:
     """
     How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
-    ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs.
+    ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs. What is not stated stays ``None``, so
+    that it follows another ``cell``; :attr:`resolved` has the numbers.
 
     :param method: of calibration; ``None``: the filter for a record in progress under load, if neither a prior nor the cell is
         known, and else least squares. ``"policy"`` is the one that comes with the package, for both parameters; its model is a
@@ -72,56 +83,60 @@ class Settings:
         (:data:`battery_env.estimators.cell_fit.RATE_PRIOR_SD`), and stated ones as cells of a kind do
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: told from the voltage of the rest before the load, of a minute at least
+    :param usual_start: how discharges of this cell start, as ``Life.usual_start`` of its life tells: a start like theirs is
+        full; ``None``: as those of the fit of ``cell`` do, or as a full cell of the model rests
     :raises ValueError: for an argument out of range, and for what a policy cannot be told. What the calibrators refuse they
         refuse when :meth:`calibrator` makes them
     """
 
     method: Method | None = None
-    cut_off_V: float = None  # type: ignore[assignment]  # it is a number as soon as the settings are made
+    cut_off_V: float | None = None
     prior_q_mobile_C: tuple[float, float] | None = None
-    mismatch_V: float = None  # type: ignore[assignment]
+    mismatch_V: float | None = None
     current_gain_sd: float = 0.005
-    thermal: bool = None  # type: ignore[assignment]
+    thermal: bool | None = None
     nominal_Ah: float | None = None
     cell: CellFit | AgingPath | CellParameters | None = None
     cell_rates_sd: Mapping[str, float] | None = None
     initial_soc: InitialSoc | Literal["rest"] = 1.0
+    usual_start: DischargeStart | None = None
 
     def __post_init__(self) -> None:
         if self.method not in (None, *METHODS):
             raise ValueError(f"the method is {' or '.join(METHODS)}, got {self.method!r}")
         if self.nominal_Ah is not None:
             check_positive("the nominal capacity in Ah", self.nominal_Ah)
-        for name, value in self._known_of_the_cell().items():
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, value)
         if self.path is not None and self.method not in (None, "least-squares"):
             raise ValueError(f"a path of aging cells is for least squares, got the method {self.method!r}")
         if self.method == "policy":
             self._refuse_for_the_policy()
-        if not 0.0 < self.cut_off_V < np.inf:
+        if not 0.0 < self.resolved.cut_off_V < np.inf:
             raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
 
     def _refuse_for_the_policy(self) -> None:
         """Refuse what a policy cannot be told: it has learned on one model, a new 18650."""
-        defaults = {field.name: field.default for field in fields(self)} | self._known_of_the_cell()
+        defaults = {field.name: field.default for field in fields(self)} | {"mismatch_V": UNFITTED_MISMATCH_V}
+        stated = vars(self) | self.resolved._asdict()
         for name in ("cell", "prior_q_mobile_C", "mismatch_V", "current_gain_sd", "initial_soc"):
-            if getattr(self, name) != defaults[name]:
+            if stated[name] != defaults[name]:
                 raise ValueError(
                     f"the policy that comes with the package takes no {name}: leave it out, or take another method"
                 )
 
-    def _known_of_the_cell(self) -> dict[str, Any]:
-        """What the cell tells where nothing else is stated."""
-        if isinstance(self.cell, CellFit | AgingPath):
-            thermal = isinstance(self.cell, CellFit) and self.cell.thermal
-            return {"cut_off_V": self.cell.cell.VEOD, "mismatch_V": self.cell.mismatch_V, "thermal": thermal}
-        return {"cut_off_V": CUT_OFF_V, "mismatch_V": UNFITTED_MISMATCH_V, "thermal": True}
+    @property
+    def resolved(self) -> ResolvedSettings:
+        """Cut-off, error to expect, kind of the model and usual start: as stated, or else as the cell tells."""
+        told = ResolvedSettings(CUT_OFF_V, UNFITTED_MISMATCH_V, thermal=True, usual_start=None)
+        if isinstance(self.cell, CellFit):
+            told = ResolvedSettings(self.cell.cell.VEOD, self.cell.mismatch_V, self.cell.thermal, self.cell.usual_start)
+        elif isinstance(self.cell, AgingPath):
+            told = ResolvedSettings(self.cell.cell.VEOD, self.cell.mismatch_V, thermal=False, usual_start=None)
+        stated = {name: value for name in told._fields if (value := getattr(self, name)) is not None}
+        return told._replace(**stated)
 
     def but(self, **others: Any) -> Settings:
         """The same with other settings; what nobody stated of another cell is what that one tells."""
-        unstated = {name: None for name, value in self._known_of_the_cell().items() if getattr(self, name) == value}
-        return replace(self, **unstated | others)
+        return replace(self, **others)
 
     @property
     def constants(self) -> CellParameters:
@@ -201,22 +216,24 @@ class Settings:
         """
         if self.method == "policy":
             return PolicyEstimator.pretrained(recorded=True)
+        resolved = self.resolved
         stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
         common: dict[str, Any] = {
             "cell": cell or self.constants,
-            "thermal": self.thermal,
+            "thermal": resolved.thermal,
             "prior_q_mobile_C": self.prior_q_mobile_C,
             "current_gain_sd": self.current_gain_sd,
             "initial_soc": stated if start is None else (start.soc, start.sd_soc),
             "q_mobile_bounds_C": self.q_mobile_bounds_C,
+            "usual_start": resolved.usual_start,
         }
         if self.method == "kalman":
             sd_r_o_ohm = self.fit.sd_r_o_ohm if self.fit else 0.0
-            return ExtendedKalmanFilter(mismatch_V=self.mismatch_V, cell_sd_r_o_ohm=sd_r_o_ohm, **common)
+            return ExtendedKalmanFilter(mismatch_V=resolved.mismatch_V, cell_sd_r_o_ohm=sd_r_o_ohm, **common)
         rates_sd = self._rates_sd()
         # constants that are anybody's, once they are free, explain as much of the error as q_mobile and r_o absorb
         is_explained = rates_sd is RATE_PRIOR_SD
-        mismatch_V = self.mismatch_V / WHOLE_ERROR if is_explained else self.mismatch_V
+        mismatch_V = resolved.mismatch_V / WHOLE_ERROR if is_explained else resolved.mismatch_V
         return LeastSquares(mismatch_V=mismatch_V, nuisance=rates_sd, path=self.path, **common)
 
     def _rates_sd(self) -> Mapping[str, float]:

@@ -2,6 +2,7 @@
 
 from battery_env.records.history import ChargeBefore as ChargeBefore
 from battery_env.records.history import ChargeHistory as ChargeHistory
+from battery_env.records.history import DischargeStart as DischargeStart
 from battery_env.records.history import history_of as history_of
 from battery_env.records.load import LEAST_LOAD_SHARE as LEAST_LOAD_SHARE
 from battery_env.records.load import LOAD_SHARE as LOAD_SHARE

@@ -47,6 +47,8 @@ _DURATION_LIMITS_S = (10.0, 1e6)
 CLOCKS = {
     "seconds": ("s", 1.0),
     "milliseconds": ("ms", 1e-3),
+    "microseconds": ("us", 1e-6),
+    "nanoseconds": ("ns", 1e-9),
     "minutes": ("min", 60.0),
     "hours": ("h", 3600.0),
     "days": ("d", 86400.0),

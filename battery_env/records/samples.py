@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
-from battery_env.checks import LOAD_LIMITS
+from battery_env.checks import LOAD_LIMITS, check_real
 from battery_env.records.load import REST_CURRENT_A, drawn
 
 #: Least and greatest time between two samples of a stream, s. Seconds given in milliseconds or in hours are mostly beyond.
@@ -29,8 +29,8 @@ _MISSING = {
     "temperature_C": "Leave it out (None) where it is missing.",
 }
 _KELVIN = "Give the temperature in degrees Celsius, not in kelvin (command line: --units temperature=K)."
-# name: least and largest plausible value, unit, what a value beyond usually is
-_PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
+#: By name: least and largest plausible value, unit, what a value beyond usually is.
+PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
     "voltage_V": (-0.1, 5.5, "V", _MILLIVOLT),  # half cells are driven a little below 0
     "current_A": (-LOAD_LIMITS["current"], LOAD_LIMITS["current"], "A", MILLIAMPERE),
     "temperature_C": (-60.0, 150.0, "degC", _KELVIN),
@@ -72,8 +72,9 @@ class Samples(NamedTuple):
 
 def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray:
     """Refuse an invalid column of a record."""
-    if values is None or np.ma.is_masked(values) or np.iscomplexobj(values):
+    if values is None or np.ma.is_masked(values):
         raise TypeError(f"{name} must hold real numbers, none of them masked, got {type(values).__name__}")
+    check_real(name, values)
     if np.asarray(values).dtype.kind in "mM":
         raise TypeError(f"{name} must hold numbers, got dates. read_discharges takes a table with dates")
     try:
@@ -87,8 +88,8 @@ def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray
     bad = np.flatnonzero(~np.isfinite(array))
     if len(bad):
         raise ValueError(f"{name} must be finite, got {array[bad[0]]} at sample {bad[0]}. Remove or fill such samples.")
-    if name in _PLAUSIBLE:
-        low, high, _, _ = _PLAUSIBLE[name]
+    if name in PLAUSIBLE:
+        low, high, _, _ = PLAUSIBLE[name]
         bad = np.flatnonzero((array < low) | (array > high))
         if len(bad):
             raise ValueError(_implausible(name, float(array[bad[0]]), f" at sample {bad[0]}"))
@@ -97,7 +98,7 @@ def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray
 
 
 def _implausible(name: str, value: float, where: str = "") -> str:
-    low, high, unit, hint = _PLAUSIBLE[name]
+    low, high, unit, hint = PLAUSIBLE[name]
     # what is too low is of no other unit, as a negative voltage of a half cell
     advice = f" {hint}" if value > high or low == -high else ""
     return f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}.{advice}"
@@ -116,6 +117,10 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
         name: check_column(name, values, least_samples)
         for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A))
     }
+    # so little is lost in the largest current that a record may hold
+    largest_A, least_A = float(np.abs(arrays["current_A"]).max(initial=0.0)), LOAD_LIMITS["current"] * np.finfo(np.float64).eps
+    if 0.0 < largest_A < least_A:
+        raise ValueError(f"current_A must reach {least_A:.1g} A, got {largest_A:g} A at most: no sensor reads so little")
     time = arrays["time_s"]
     for name, array in arrays.items():
         if len(array) != len(time):
@@ -152,7 +157,7 @@ def check_sample(
     if temperature_C is not None:
         measured["temperature_C"] = temperature_C
     for name, value in measured.items():
-        low, high, _, _ = _PLAUSIBLE[name]
+        low, high, _, _ = PLAUSIBLE[name]
         if _is_within(name, value, low, high) or (name == "voltage_V" and previous_A is not None and isnan(value)):
             continue
         if isfinite(value):
@@ -172,6 +177,8 @@ def check_sample(
 
 def _is_within(name: str, value: float, low: float, high: float) -> bool:
     try:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError("a truth value")
         return low <= value <= high
     except TypeError as error:
         raise TypeError(f"{name} must be a number, got {value!r}. {_MISSING.get(name, '')}".strip()) from error

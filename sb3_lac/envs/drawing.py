@@ -1,5 +1,7 @@
 import inspect
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from numbers import Integral, Real
 from typing import Any
 
@@ -58,6 +60,8 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
       print(info["drawn"])
 
     They must be numbers that the environment reads while it runs: what it has copied, as into a simulator, stays as it is.
+    Those that lie deeper are named by their path, as ``"model.opt.gravity[2]"`` and ``"model.body_mass[1]"`` of MuJoCo. For a
+    factor of a whole array give the environment a property that sets the array, and draw that.
 
     :param env: The environment
     :param drawn: Smallest and largest value of each attribute, in its unit; drawn uniformly, and in whole numbers where the
@@ -70,7 +74,18 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         super().__init__(env)
         plant = env.unwrapped
         numbers = {name: inspect.getattr_static(plant, name) for name in dir(plant) if not name.startswith("_")}
-        numbers = {name: value for name, value in numbers.items() if isinstance(value, Real) and not isinstance(value, bool)}
+        numbers = {name: value for name, value in numbers.items() if _is_number(value)}
+        for name in drawn.keys() - numbers.keys():
+            with suppress(AttributeError, LookupError, TypeError):
+                owner, part = _place(plant, name)
+                value = owner[part] if _has_items(owner) else getattr(owner, part)
+                if np.size(value) > 1:
+                    raise ValueError(
+                        f"{name} has {np.size(value)} numbers. Draw one of them, as {name}[0], or give the environment a "
+                        "property that sets all of them, and draw that."
+                    )
+                if _is_number(value):
+                    numbers[name] = value
         self._draw = Draw(drawn, numbers)
         self._generator = np.random.default_rng()
         self._drawn: dict[str, float] = {}
@@ -82,7 +97,11 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             self._generator = np.random.default_rng((seed, 1))
         self._drawn = self._draw(self._generator)
         for name, value in self._drawn.items():
-            setattr(self.env.unwrapped, name, value)
+            owner, part = _place(self.env.unwrapped, name)
+            if _has_items(owner):
+                owner[part] = value
+            else:
+                setattr(owner, part, value)
         observation, info = self.env.reset(seed=seed, options=options)
         return observation, {**info, "drawn": dict(self._drawn)}
 
@@ -90,3 +109,19 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         """Move on by one step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         return observation, reward, terminated, truncated, {**info, "drawn": dict(self._drawn)}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _has_items(owner: Any) -> bool:
+    return isinstance(owner, (np.ndarray, list, dict))
+
+
+def _place(plant: Any, name: str) -> tuple[Any, Any]:
+    """Find the object that a path like ``model.body_mass[1]`` ends in, and the name or the index there."""
+    *path, last = [int(part) if part.isdigit() else part for part in re.findall(r"[^.\[\]]+", name)]
+    for part in path:
+        plant = plant[part] if _has_items(plant) else getattr(plant, part)  # type: ignore[arg-type]
+    return plant, last

@@ -12,6 +12,7 @@ import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_lac.costs import advice_for_a_time_limit
 from sb3_lac.stability.functions import LyapunovFunction
 from sb3_lac.stability.loop import ClosedLoop, closed_loop
 from sb3_lac.stability.rollout import flatten, summarize_episodes
@@ -100,7 +101,8 @@ class CertificationReport:
 
     def _meaning(self, name: str) -> str:
         if name == "survives":
-            return "no termination"
+            advice = advice_for_a_time_limit(self.episodes["length"].to_numpy()) if self.episodes["terminated"].any() else ""
+            return f"no termination. {advice}".rstrip(". ")
         if name == "stays_within":
             start_cost = self.transitions.loc[self.transitions["step"] == 0, "cost"].mean()
             return (

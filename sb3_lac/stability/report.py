@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_lac.costs import CostAlgorithm
+from sb3_lac.costs import CostAlgorithm, advice_for_a_time_limit
 from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
 from sb3_lac.stability.loop import closed_loop
 from sb3_lac.stability.rollout import summarize_episodes
@@ -137,7 +137,8 @@ class LyapunovReport:
     def _why_not(self) -> str | None:
         metrics = self.metrics
         if metrics["death_rate"].value > 0:
-            return f"{self.episodes['terminated'].sum()} of {len(self.episodes)} episodes died"
+            died = f"{self.episodes['terminated'].sum()} of {len(self.episodes)} episodes died"
+            return f"{died}. {advice_for_a_time_limit(self.episodes['length'].to_numpy())}".rstrip(". ")
         if not np.isfinite(self.transitions["lyapunov"]).all():
             return "L is not finite everywhere, as with gamma=1 and positive rewards"
         if math.isnan(metrics["largest_feasible_alpha3"].low) and metrics["largest_feasible_alpha3"].value > 0:

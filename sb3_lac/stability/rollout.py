@@ -71,6 +71,11 @@ class _Actor:
         parameters = inspect.signature(policy.predict).parameters
         takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
         self.asked = [name for name in ("state", "episode_start") if takes_all or name in parameters]
+        if not takes_all and "deterministic" not in parameters:
+            raise ValueError(
+                f"predict() of {type(policy).__name__} must take deterministic, which asks for the mean action. A controller "
+                "that knows no other ignores it: def predict(self, observation, deterministic=True)."
+            )
         self.masked = "action_masks" in parameters and env.has_attr("action_masks")
         self.state: tuple[np.ndarray, ...] | None = None
 

@@ -19,6 +19,7 @@ from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import METHODS, Settings
 from battery_env.loads import constant as constant_load
+from battery_env.records import ChargeBefore, DischargeStart
 from battery_env.records.discharge import Discharge, load_nasa_discharges
 from tests.sweeps import sweep
 
@@ -228,9 +229,16 @@ class TestRealCells:
 
 
 class TestFiles:
-    def test_a_fit_and_constants_survive_their_files_and_are_read_for_what_they_are(self, fit, tmp_path):
+    @pytest.mark.parametrize("charge", [None, ChargeBefore(4.2, 0.05, 1.5, 600.0)])
+    def test_a_fit_and_constants_survive_their_files_and_are_read_for_what_they_are(self, charge, fit, tmp_path):
+        fit = dataclasses.replace(fit, usual_start=DischargeStart(4.18, 0.0, 0.01, charge))
         assert read_cell(fit.to_json(tmp_path / "fit.json")) == fit
         assert read_cell(OTHER.to_json(tmp_path / "constants.json")) == OTHER
+        # a fit of an older release does not tell how its discharges start
+        old = json.loads((tmp_path / "fit.json").read_text())
+        del old["usual_start"]
+        (tmp_path / "old.json").write_text(json.dumps(old))
+        assert read_cell(tmp_path / "old.json") == dataclasses.replace(fit, usual_start=None)
         (tmp_path / "other.json").write_text("{}")
         with pytest.raises(ValueError, match=r"other\.json holds no"):
             read_cell(tmp_path / "other.json")
@@ -260,14 +268,31 @@ class TestFiles:
     @pytest.mark.parametrize("method", [method for method in METHODS if method != "policy"])
     def test_settings_use_all_that_a_fit_knows(self, method, fit):
         settings = Settings(cell=fit, method=method)
-        assert (settings.constants, settings.mismatch_V, settings.cut_off_V) == (fit.cell, fit.mismatch_V, fit.cell.VEOD)
+        assert settings.constants == fit.cell
+        assert settings.resolved == (fit.cell.VEOD, fit.mismatch_V, fit.thermal, fit.usual_start)
         estimator, own = settings.calibrator(fit.cell), fit.calibrator()
         assert estimator.bounds == own.bounds and estimator.bounds["q_mobile"][1] == pytest.approx(1.2 * fit.cell.q_mobile)
-        assert Settings(cell=fit, mismatch_V=0.1).mismatch_V == 0.1 and Settings(cell=OTHER).mismatch_V == 0.05
+        assert Settings(cell=OTHER).resolved.mismatch_V == 0.05
         assert Settings(method=method).calibrator(NEW_CELL).bounds == LeastSquares().bounds == ExtendedKalmanFilter().bounds
-        assert not Settings(cell=dataclasses.replace(fit, thermal=False)).thermal
-        assert Settings(method=method).but(cell=fit) == settings and settings.but(cell=OTHER).mismatch_V == 0.05
-        assert Settings(mismatch_V=0.1).but(cell=fit).mismatch_V == 0.1
+        assert not Settings(cell=dataclasses.replace(fit, thermal=False)).resolved.thermal
+
+    @pytest.mark.parametrize("other", [Settings.but, dataclasses.replace])
+    def test_what_is_stated_stays_as_stated_with_another_cell_and_nothing_else_does(self, other, fit):
+        isothermal = dataclasses.replace(fit, thermal=False)
+        # also where what is stated is what holds when nothing is
+        for stated in ({"mismatch_V": 0.05}, {"cut_off_V": 2.7}, {"thermal": True}, {"mismatch_V": 0.1, "cut_off_V": 3.0}):
+            for cell in (fit, isothermal, OTHER, None):
+                whole = Settings(**stated, cell=cell)
+                assert other(Settings(**stated), cell=cell) == whole == other(Settings(**stated, cell=fit), cell=cell)
+                assert whole.resolved == Settings(cell=cell).resolved._replace(**stated)
+
+    def test_settings_and_keywords_say_the_same(self, fit):
+        cell = dataclasses.replace(fit, cell=fit.cell.replace(VEOD=3.0))
+        record = discharged(fit.cell, 6500.0, 0.15, fit.currents_A[0])
+        by_settings = calibrate(record, Settings(mismatch_V=0.05, cut_off_V=2.7), cell=cell)
+        by_keywords = calibrate(record, mismatch_V=0.05, cut_off_V=2.7, cell=cell)
+        assert by_settings.sd_q_mobile_C == by_keywords.sd_q_mobile_C
+        assert by_settings.capacity_Ah == by_keywords.capacity_Ah > calibrate(record, cell=cell).capacity_Ah
 
     @pytest.mark.parametrize(
         ("kind", "change", "message"),
@@ -281,6 +306,9 @@ class TestFiles:
             (CellParameters, lambda content: content["constants"].update(Ap=1.0), "damaged"),
             (CellParameters, lambda content: content.update(constants=[1.0]), "given by name"),
             (CellParameters, lambda content: content.pop("constants"), "damaged"),
+            (CellFit, lambda content: content.update(usual_start=[4.1]), "damaged"),
+            (CellFit, lambda content: content.update(usual_start=["full", 0.0, 0.0, None]), "damaged"),
+            (CellFit, lambda content: content.update(usual_start=[4.1, 0.0, 0.0, [4.2]]), "damaged"),
             *((CellFit, lambda content, name=name: content.pop(name), "damaged") for name in FIELDS),
             *((CellFit, lambda content, name=name: content.update({name: None}), "damaged") for name in FIELDS),
             *((CellFit, lambda content, name=name: content.update({name: [{"name": "kn"}]}), "damaged") for name in FIELDS),

@@ -153,7 +153,7 @@ def test_whatever_is_put_together_the_discharges_are_those_that_were_written(tmp
         try:
             found = read_discharges(write(f, tmp_path))
         except ValueError as refused:
-            # rows that come again and clocks at midnight and of steps go back; row numbers and words may have no known name
+            # rows that come again and clocks of steps go back; row numbers and words may have no known name
             assert f["repeated"] or f["clock"] in ("day", "step") or f["index"] or not f["sign"]
             said = r"the clock goes back: row \d+|rows have|no column for the time|has no sign: from row|must hold numbers"
             assert re.search(said, str(refused)), refused

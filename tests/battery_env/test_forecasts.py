@@ -56,7 +56,7 @@ class TestLoads:
 
     def test_a_recorded_cell_ends_at_the_same_voltage_as_everywhere(self):
         found = forecast(half(discharged(4.0, load_unit="current")), TRUTH, samples=3)
-        assert found.cut_off_V == Settings().cut_off_V == 2.7
+        assert found.cut_off_V == Settings().resolved.cut_off_V == 2.7
 
     def test_a_known_profile_ends_when_the_cell_does(self):
         record = discharged(RandomPiecewise((4.0, 12.0))(np.random.default_rng(3)))

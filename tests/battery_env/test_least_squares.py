@@ -29,6 +29,20 @@ def b0005() -> list[Discharge]:
     return [discharge.loaded_part(2.7) for discharge in load_nasa_discharges("B0005")]
 
 
+def test_the_width_of_a_likelihood_is_found_at_any_distance_to_the_least_q_mobile(b0005, monkeypatch):
+    record, both, free = b0005[80], ("q_mobile", "r_o"), {"q_mobile": (100.0, 1e7), "r_o": (-1.0, 30.0)}
+    search = Search.of(Samples.of(record), LeastSquares().model, both, {}, free)
+    search = replace(search, error=ErrorModel(0.05, 0.001, 0.1, 6.0, 1000.0))
+    fit = search.best(search.best_starts([]), [])
+    own = search.spread(fit, [], 1.0)
+    spreads = []
+    for distance_C in (*np.logspace(-300, 12, 105), 0.0):
+        least_C = fit.values["q_mobile"] - distance_C
+        monkeypatch.setattr(Search, "least_q_at_C", lambda *_, least_C=least_C: (least_C, 0.0))
+        spreads.append(search.spread(fit, [], 1.0))
+    assert np.isfinite(spreads).all() and max(spreads) < 2.0 * own
+
+
 class TestCleanRecords:
     @pytest.mark.parametrize("power_W", sweep(16.0, 4.0, 8.0))
     @pytest.mark.parametrize("q_mobile", sweep(7600.0, 4000.0))

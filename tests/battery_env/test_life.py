@@ -1,11 +1,17 @@
 """A cell over its discharges: what is carried on is as sure as it says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import Discharge, LeastSquares, Settings, load_nasa_discharges, track_life
+from battery_env import Discharge, LeastSquares, Settings, calibrate, fit_cell, load_nasa_discharges, track_life
+from battery_env.electrochemistry import initial_state, simulate
 from battery_env.lab.life import life_of
+from battery_env.lab.running import forecast_end
+from battery_env.records import ChargeBefore, ChargeHistory
+from tests.sweeps import sweep
 
 
 def followed(q_mobile_C, **columns):
@@ -125,3 +131,82 @@ class TestRealCell:
         assert life.prior_q_mobile_C[0] == pytest.approx(track_life([first, fourth], 3.2).prior_q_mobile_C[0], rel=0.002)
         with pytest.raises(ValueError, match=r"Of 1 of 1: the voltage falls to 2\.00 V"):
             track_life([broken], cut_off_V=3.2)
+
+
+def partly_charged(soc, charge_V=None, load_A=2.0, rest_rows=20, q_mobile_C=7000.0, seed=0):
+    """A discharge from some charge on, after a charge with 1.5 A to some voltage without a taper, if that was recorded."""
+    record = simulate(load_A, q_mobile_C, 0.12, load_unit="current", cut_off_V=2.6, initial=initial_state(q_mobile_C, soc=soc))
+    time_s = np.arange(-10.0 * rest_rows, record.time_s[-1], 10.0)
+    noise_V = 0.002 * np.random.default_rng(seed).standard_normal(len(time_s))
+    voltage_V = np.interp(time_s if rest_rows else time_s + 30.0, record.time_s, record.voltage_V) + noise_V
+    charge = None if charge_V is None else ChargeBefore(charge_V, 1.5, 1.5, 0.0)
+    current_A = np.where(time_s < 0.0, 0.0, load_A)
+    return Discharge(time_s - time_s[0], voltage_V, current_A, history=ChargeHistory(charge=charge))
+
+
+def regular_life(soc, charge_V=None, rest_rows=20, count=5):
+    q_C = 7000.0 * np.exp(-0.003 * np.arange(count))
+    return [partly_charged(soc, charge_V, 2.0, rest_rows, q_mobile_C, n) for n, q_mobile_C in enumerate(q_C.tolist())]
+
+
+class TestStart:
+    @pytest.mark.parametrize(("charge_V", "rest_rows"), sweep((None, 20), (4.11, 0), (4.11, 20)))
+    @pytest.mark.parametrize("soc", sweep(0.88, 0.8, 0.95))
+    def test_a_life_that_starts_and_lasts_alike_says_itself_what_is_full(self, soc, charge_V, rest_rows):
+        *before, last = regular_life(soc, charge_V, rest_rows)
+        life = track_life(before, cut_off_V=2.7)
+        start_s, end_s = last.load_on_time_s, last.eod_time_s(2.7)
+        seen = last.until(start_s + 0.5 * (end_s - start_s))
+        assert life.table["valid"].all() and life.usual_start.voltage_V == pytest.approx(last.voltage_V[0], abs=0.01)
+        found = forecast_end(seen, life=life)
+        low_s, median_s, high_s = found.eod_quantile_s()
+        assert low_s < end_s < high_s and median_s == pytest.approx(end_s, abs=0.02 * (end_s - start_s))
+        assert not any("discharges of its life" in note for note in found.notes)
+
+    @pytest.mark.parametrize("rest_rows", sweep(20, 0))
+    @pytest.mark.parametrize("soc", sweep(0.72, 1.0))
+    def test_one_that_starts_otherwise_is_told_so(self, soc, rest_rows):
+        life = track_life(regular_life(0.86, None, rest_rows), cut_off_V=2.7)
+        running = partly_charged(soc, None, 2.0, rest_rows).until(1500.0)
+        notes = " ".join(forecast_end(running, life=life).notes)
+        assert "where the discharges of its life, or of its fit, do at" in notes and "fit constants" not in notes
+        assert track_life([*regular_life(0.86, None, rest_rows), running], 2.7).table["valid"].iloc[-1] == np.False_
+
+    @pytest.mark.parametrize("charge_V", sweep(4.11, 3.98))
+    def test_at_another_load_without_a_rest_the_charge_before_tells(self, charge_V):
+        life = track_life(regular_life(0.88, 4.11, 0), cut_off_V=2.7)
+        running = partly_charged(0.88, charge_V, 3.0, 0).until(1000.0)
+        notes = " ".join(forecast_end(running, life=life).notes)
+        assert ("discharges of its life" in notes) == (charge_V != 4.11)
+
+    def test_a_life_that_starts_or_lasts_otherwise_each_time_tells_nothing(self):
+        starts = [partly_charged(soc, seed=n) for n, soc in enumerate((0.95, 0.8, 0.7, 0.6))]
+        with pytest.raises(ValueError, match="a full cell at rest shows"):
+            track_life(starts, cut_off_V=2.7)
+        lasts = [partly_charged(0.88, q_mobile_C=q_C) for q_C in (7000.0, 6000.0, 7000.0, 6000.0)]
+        with pytest.raises(ValueError, match="a full cell at rest shows"):
+            track_life(lasts, cut_off_V=2.7)
+
+    @pytest.mark.parametrize("method", ["least-squares", "kalman"])
+    @pytest.mark.parametrize(("charge_V", "rest_rows"), sweep((None, 20), (4.11, 0)))
+    def test_no_fit_rejects_its_own_discharges(self, charge_V, rest_rows, method, recwarn):
+        own = regular_life(0.88, charge_V, rest_rows, count=2)
+        fit = fit_cell(own)
+        for each in (*own, regular_life(0.88, charge_V, rest_rows)[-1]):
+            found = calibrate(each, cell=fit, method=method)
+            assert "tarts at" not in found.reason and found.capacity_Ah == pytest.approx(found.drawn_Ah)
+            assert "tarts at" not in fit.calibrator().estimate(each.loaded_part(2.7)).reason
+        lower = calibrate(partly_charged(0.7, None, 2.0, rest_rows), cell=fit, method=method)
+        assert "where the discharges of its life, or of its fit, do at" in lower.reason and np.isnan(lower.capacity_Ah)
+        # a fit of an older release does not tell
+        old = replace(fit, usual_start=None)
+        assert (
+            calibrate(own[0], cell=old, method=method).reason != calibrate(own[0], cell=fit, method=method).reason
+            or not charge_V
+        )
+
+    def test_bundled_lives_start_as_full_cells_do(self):
+        for cell in ("B0005", "B0006"):
+            life = load_nasa_discharges(cell)[:40:8]
+            known = track_life(life, 2.7)
+            assert known.usual_start.voltage_V == pytest.approx(4.19, abs=0.02) and known.table["valid"].all()

@@ -58,6 +58,7 @@ DAYS = {
     style: [(style.format(int(t // 86400)) if t >= 86400.0 else "") + clock(t % 86400.0) for t in LATER]
     for style in ("{}-", "{}.", "{} days ", "{} day, ", "{}d ")
 }
+TIMES_OF_DAY = (START + pd.to_timedelta(RECORD.time_s, unit="s")).strftime("%H:%M:%S.%f")
 DEAD = pd.DataFrame({"time": [-2.0, -1.0], "voltage": 0.003, "current": 0.0})
 ELECTRODES = named("time/s", "Ewe-Ece/V", "I/A", **{"Ece/V": np.linspace(0.05, 0.2, ROWS)})
 ELECTRODES["Ewe/V"] = ELECTRODES["Ewe-Ece/V"] + ELECTRODES["Ece/V"]
@@ -89,9 +90,34 @@ READ = {
         named("Date", "U", "I").assign(Date=pd.Series(DATES.strftime("%d.%m.%Y %X")).mask(TABLE.index == 9)),
         "10",
     ),
-    "a voltage that is missing": (at([40, 90], voltage=np.nan), "left out, as the voltage is missing: row 41 and 1 more"),
-    "words in a row": (at(50, time="Step", voltage="three", current=""), "no measurement of a cell: row 51"),
-    "no cell at the ends": (pd.concat([DEAD, TABLE], ignore_index=True), "no measurement of a cell: row 1 and 1 more"),
+    "a voltage that is missing": (
+        at([40, 90], voltage=np.nan),
+        "left out, as the voltage is missing in row 41, 91 (2 rows)",
+    ),
+    "what a meter could not read": (at([5, 100], current=9.9e37), "lies beyond -1000 .. 1000 A in row 6, 101 (2 rows)"),
+    "bytes that were lost": (
+        at([41, 42], voltage=114694.0, current=-589843.0),
+        "the voltage lies beyond -0.1 .. 5.5 V in row 42 to 43 (2 rows); the current lies beyond",
+    ),
+    "words in a row": (at(50, time="Step", voltage="three", current=""), "no measurement of a cell in row 51"),
+    "no cell at the ends": (pd.concat([DEAD, TABLE], ignore_index=True), "no measurement of a cell in row 1 to 2 (2 rows)"),
+    "a time of day": (named(time=TIMES_OF_DAY), "the time of day 'time' passes midnight: a day more from row 65 on"),
+    "a time of day with decimal commas": (named(time=TIMES_OF_DAY.str.replace(".", ",")), "passes midnight"),
+    "a time of day that is a number": (named(time=(RECORD.time_s + 85800.0) % 86400.0), "passes midnight"),
+    "a time of day, of a cycle each": (named(time=TIMES_OF_DAY, Cycle=1 + (RECORD.time_s > 600.0)), "passes midnight"),
+    **{
+        f"{tick} since 1970": (named(time=((1.6e9 + RECORD.time_s) * per_s).round().astype(np.int64)), "")
+        for tick, per_s in (("ms", 1e3), ("us", 1e6), ("ns", 1e9))
+    },
+    "us by name": (named("time_us", "U", "I").assign(time_us=1e6 * RECORD.time_s), ""),
+    "ns by name": (named("Time (ns)", "U", "I").assign(**{"Time (ns)": 1e9 * RECORD.time_s}), ""),
+    **{
+        f"dates as {style} beside minutes of each step": (
+            named(time=RECORD.time_s % 900.0 / 60.0, Date=DATES.strftime(style)),
+            "the time is 'Date', as 'time' goes back",
+        )
+        for style in ("%Y-%m-%d,%H:%M:%S.%f", "%Y-%m-%d-%H:%M:%S.%f", "%d.%m.%Y, %H:%M:%S.%f", "%Y/%m/%d_%H:%M:%S.%f")
+    },
     "a row twice": (pd.concat([TABLE[:100], TABLE[99:]], ignore_index=True), "row 101 has the time of the row before"),
     "a fault of the voltage": (at(100, voltage=0.003), ""),
     "rows of Float64 and an index": (TABLE.astype("Float64").set_index("time"), ""),
@@ -123,7 +149,7 @@ REFUSED = {
     ),
     "an unknown unit": (named("time (furlong)", "U", "I"), r"no column for the time\. header time \(furlong\), U, I"),
     "several cells": (named(**{"Cell ID": np.where(LOADED, "A", "B")}), r"'Cell ID' names 2 cells \(B, A\): give each a file"),
-    "a step": (TABLE[:4], "needs 5 rows below the header, got 4"),
+    "a step": (TABLE[:4], "needs 5 rows with a time, a voltage and a current, got 4"),
     "words for numbers": (named(voltage="OVERLOAD"), "'voltage' must hold numbers, got 'OVERLOAD' in row 1"),
     "separators of thousands": (
         named(time=[f"{1e3 * t:,.1f}" for t in RECORD.time_s]),
@@ -131,13 +157,29 @@ REFUSED = {
     ),
     "many values that are missing": (
         at([*range(90, 130)], current=np.nan),
-        "the current must be finite, got nan in row 91 and 39",
+        r"the current is missing in row 91 to 130 \(40 rows\)\. Of 322 rows at most 3 are left out: remove these, or fill",
+    ),
+    "values that are missing in two columns": (
+        at([*range(10, 60, 10)], current=np.nan).assign(voltage=TABLE["voltage"].mask(TABLE.index == 321)),
+        r"voltage is missing in row 322; the current is missing in row 11, 21, 31, 41, 51 \(5 rows\)",
+    ),
+    "bytes that are often lost": (
+        at([*range(10, 110, 10)], current=589843.0),
+        r"the current lies beyond -1000 .. 1000 A in row 11, 21, .*, 101 \(10 rows\)\. Of 322 rows at most 3",
+    ),
+    "truth values": (named(current=LOADED), "the column 'current' must hold real numbers, got np.False_"),
+    "complex numbers": (named(current=TABLE["current"] + 0j), "the column 'current' must hold real numbers, got np.complex"),
+    "next to nothing": (named(current=1e-300 * TABLE["current"]), "current_A must reach 2e-13 A, got 2.01529e-300 A at most"),
+    "microseconds": (
+        named(time=1e6 * RECORD.time_s),
+        r"too long for a discharge. Give the time in seconds: .*--units time=us",
     ),
     "a clock that goes back": (
         named(time=RECORD.time_s - 10.0 * (TABLE.index >= 150)),
         r"goes back: row 151 is at .* s, after",
     ),
-    "the newest row first": (TABLE[::-1], "goes back: row 2 and 320 more"),
+    "the newest row first": (TABLE[::-1], "goes back: row 2 to 322"),
+    "a time of day that stops at noon": (named(time=(RECORD.time_s + 42000.0) % 43200.0), "goes back: row 130"),
     "a clock of each step": (
         named(time=RECORD.time_s - RECORD.time_s[150] * (TABLE.index >= 150)),
         "goes back: row 151 is at 0 s",
@@ -163,7 +205,6 @@ REFUSED = {
         r"too short for a discharge\.$",
     ),
     "millivolts": (named(voltage=1e3 * RECORD.voltage_V), "voltage_V must lie within .*--units voltage=mV"),
-    "what a meter could not read": (at([5, 100], current=9.9e37), "current_A must lie within|cannot be told"),
     "no current": (named(current=0.0), "no current flows"),
     "so little that it is noise": (named(current=1e-6 * (TABLE.index == 7)), "no current flows"),
     "no sign": (HALF_SIGN, r"the current has no sign: from row 1 on the voltage rises.*--columns state=NAME"),
@@ -233,7 +274,7 @@ TEXTS = {
     "an end that a power cut left": (TEXT.encode() + bytes(4096), "NUL bytes"),
     "UTF-16": (TEXT.encode("utf-16"), ""),
     "Chinese": ("总时间(s),电压(V),电流(A)\n".encode("gb18030") + "\n".join(LINES).encode(), ""),
-    "a last line that is cut": (TEXT[: TEXT.rindex(",")], "left out, as the current is missing: row 322"),
+    "a last line that is cut": (TEXT[: TEXT.rindex(",")], "left out, as the current is missing in row 322"),
     "remarks behind": ("\n".join([HEADER, *LINES[:200], *(f"{line},ok" for line in LINES[200:])]), ""),
     "row numbers": ("," + HEADER + "\n" + "\n".join(f"{n},{line}" for n, line in enumerate(LINES)), ""),
 }
@@ -348,6 +389,62 @@ def test_loops_of_pulses_are_one_discharge_wherever_the_counter_goes_up(counter)
     voltage_V = 4.19 - 1.4 * charge_C / 7200.0 - 0.1 * current_A
     columns = {"time": np.cumsum(every_s), "voltage": voltage_V, "current": -current_A, "Cycle": (step + 5 - counter) // 6}
     assert read(pd.DataFrame(columns)).charge_C == pytest.approx(charge_C[-1], rel=0.02)
+
+
+def parts_in_turn(*parts):
+    """Tables one after another, on one clock."""
+    begins_s = np.cumsum([0.0, *(np.ptp(part["time"]) + 30.0 for part in parts)])
+    return pd.concat(
+        [part.assign(time=part["time"] - part["time"].iloc[0] + begin) for part, begin in zip(parts, begins_s, strict=False)],
+        ignore_index=True,
+    )
+
+
+@pytest.mark.parametrize("share", [0.03, 0.08, 0.12, 0.17])
+@pytest.mark.parametrize("told", ["a rest", "a number", "a state", "all"])
+def test_a_short_charge_that_the_file_tells_is_one(share, told):
+    """It gives back less than a fifth, and what is drawn then is a discharge of its own, or named as left aside."""
+    low = pd.DataFrame({"time": np.arange(0.0, 900.0, 60.0), "voltage": 3.35, "current": 0.0})
+    count = int(LOADED.sum() * share)
+    charge_A, charge_s = 1.1 * share * RECORD.charge_C / 195.0, np.arange(0.0, 200.0, 5.0)
+    charge = pd.DataFrame({"time": charge_s, "voltage": np.linspace(3.6, 4.1, 40), "current": charge_A})
+    short = TABLE[LOADED][-count:]
+    parts = [CYCLE.assign(Cycle=1), CYCLE.assign(Cycle=2), charge.assign(Cycle=3), short.assign(Cycle=3)]
+    parts[2:2] = [low.assign(Cycle=2)] if told in ("a rest", "all") else []
+    table = parts_in_turn(*parts)
+    table["State"] = np.where(table["current"] > 0.0, "Chg", np.where(table["current"] < -1.0, "DChg", "Rest"))
+    table = table.drop(columns={"a number": ["State"], "a state": ["Cycle"], "a rest": ["State", "Cycle"]}.get(told, []))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        discharges = read_discharges(table)
+    for whole in discharges[:2]:
+        near(whole)
+    said = "; ".join(str(each.message) for each in caught)
+    if share > 0.1:
+        assert len(discharges) == 3 and not said
+        assert discharges[2].charge_C == pytest.approx(share * RECORD.charge_C, rel=0.1)
+        assert discharges[2].history.charge.highest_V == pytest.approx(4.1)
+    else:
+        assert len(discharges) == 2 and re.search(r"left aside, as they draw less than 10% .* Ah in rows \d+ to", said)
+
+
+@pytest.mark.parametrize("downhill_s", [10, 60])
+def test_braking_parts_no_discharge_where_the_tester_calls_it_a_charge(downhill_s):
+    """Loops of a drive with stops before and after braking, and a state by the sign of the current."""
+    loop = [(240, 3.0), (90, 0.0), (60, 3.0), (downhill_s, -1.5), (90, 0.0)]
+    steps = [(300, 0.0), *(12 * loop), (300, 0.0)]
+    current_A = np.concatenate([np.full(length // 5, current_A) for length, current_A in steps])
+    charge_C = 5.0 * np.cumsum(current_A)
+    table = pd.DataFrame(
+        {
+            "time": 5.0 * np.arange(len(current_A)),
+            "voltage": 4.19 - 1.2 * charge_C / 12000.0 - 0.05 * current_A,
+            "current": -current_A,
+            "Cycle": np.repeat(np.arange(len(steps)) // len(loop), [length // 5 for length, _ in steps]),
+            "State": np.select([current_A > 0.0, current_A < 0.0], ["D", "C"], "R"),
+        }
+    )
+    assert read(table).charge_C == pytest.approx(charge_C[-1], rel=0.02)
 
 
 def test_what_is_left_aside_is_named_and_a_mistake_in_some_cycles_loses_no_other():

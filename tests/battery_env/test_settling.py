@@ -10,7 +10,7 @@ from battery_env.estimators import CellFit, Estimate, ExtendedKalmanFilter, Leas
 from battery_env.estimators.reasons import Reason, is_only_imprecise
 from battery_env.estimators.verdict import Assumptions, Diagnosis
 from battery_env.lab.settings import METHODS, Settings
-from battery_env.records import expected_current
+from battery_env.records import DischargeStart, expected_current
 from tests.sweeps import sweep
 
 CALIBRATORS = {
@@ -96,6 +96,14 @@ VERDICTS = {
         "The record starts at 3.83 V under 0 A, where a cell with 85% of its charge at rest shows 4.03 V",
     ),
     "late start": (BOTH, changed(WHOLE, slice(300, None), rested=False), {}, "The record starts at 3.73 V under 2 A"),
+    "higher than others of its cell": (
+        BOTH, REAL.loaded_part(2.7), {"usual_start": DischargeStart(4.05, 0.0, 0.005)},
+        "The record starts at 4.20 V under 0 A, where the discharges of its life, or of its fit, do at 4.05 V under 0 A",
+    ),
+    "lower than others of its cell": (
+        BOTH, REAL.loaded_part(2.7), {"usual_start": DischargeStart(4.28, 0.0, 0.005)},
+        "The record starts at 4.20 V under 0 A, where the discharges of its life, or of its fit, do at 4.28 V under 0 A",
+    ),
     "forgotten reset": (("filter",), TWICE, {}, "The voltage comes back to that of the start at 2882 s"),
     "stuck voltage": (BOTH, STUCK, {}, "The current changes by -2.00 A at 1200 s, and the voltage does not follow."),
     "its clock": (BOTH, changed(STUCK, late_s=50_000.0), {}, "The current changes by -2.00 A at 51200 s"),

@@ -84,6 +84,8 @@ class TestSamples:
             ((4.1, None, 1.0), TypeError, "current_A must be a number, got None"),
             ((4.1, 2.0, None), TypeError, "dt_s must be a number, got None"),
             ((4.1, 2.0, "1"), TypeError, "dt_s must be a number, got '1'"),
+            ((4.1, True, 1.0), TypeError, "current_A must be a number, got True"),
+            ((4.1, 2j, 1.0), TypeError, "current_A must be a number, got 2j"),
             ((np.inf, 2.0, 1.0), ValueError, "voltage_V must be finite, got inf"),
             ((3.7, 2000.0, 1.0), ValueError, "current_A must lie within -1000 .. 1000 A, got 2000. .* not in mA"),
             ((3700.0, 2.0, 1.0), ValueError, "voltage_V must lie within -0.1 .. 5.5 V, got 3700. .* not in mV"),

@@ -17,13 +17,14 @@ from tests.sweeps import sweep
 def sizes_of_samples(model, monkeypatch, gradient_steps):
     """How many transitions each call for samples of a call of ``train()`` asks for."""
     sizes = []
-    sample = model.replay_buffer.sample
+    kind = type(model.replay_buffer)
+    sample = kind.sample
 
-    def counted(batch_size, env=None):
+    def counted(self, batch_size, env=None):
         sizes.append(batch_size)
-        return sample(batch_size, env=env)
+        return sample(self, batch_size, env=env)
 
-    monkeypatch.setattr(model.replay_buffer, "sample", counted)
+    monkeypatch.setattr(kind, "sample", counted)
     model.train(gradient_steps, model.batch_size)
     return sizes
 
@@ -63,19 +64,28 @@ def test_each_transition_is_in_one_batch_and_those_in_line_are_not_in_the_same()
         assert batch.actions.is_contiguous() and batch.discounts is None
 
 
-def test_each_batch_has_as_many_goals_of_its_own(make_model):
+@pytest.mark.parametrize("name", ["sample", "_get_samples"])
+def test_a_method_that_is_replaced_on_the_buffer_at_hand_is_asked_for_one_batch_an_update(make_model, n_updates, name):
+    model = make_model()
+    method, calls = getattr(model.replay_buffer, name), []
+    setattr(model.replay_buffer, name, lambda *args, **kwargs: calls.append(1) or method(*args, **kwargs))
+    model.train(5, model.batch_size)
+    assert len(calls) == n_updates(model) == 5
+
+
+def test_each_batch_has_as_many_goals_of_its_own(make_model, monkeypatch):
     env = BitFlippingEnv(n_bits=3, continuous=True)
     model = make_model(env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, learning_starts=60, n_collect=60)
     real, virtual = [], []
     for name, rows in (("_get_real_samples", real), ("_get_virtual_samples", virtual)):
-        got = getattr(model.replay_buffer, name)
+        got = getattr(HerReplayBuffer, name)
 
         def marked(*args, got=got, rows=rows):
             samples = got(*args)
             rows.append(len(samples.rewards))
             return samples._replace(actions=th.full_like(samples.actions, float(rows is virtual)))
 
-        setattr(model.replay_buffer, name, marked)
+        monkeypatch.setattr(HerReplayBuffer, name, marked)
     shares = [batch.actions.mean().item() for batch, _ in model._batches(10, 20)]
     assert (real, virtual) == ([40], [160])
     assert shares == pytest.approx(10 * [0.8])

@@ -4,10 +4,12 @@ import copy
 import pickle
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -421,6 +423,9 @@ class TestDomainRandomization:
         [
             ({"mass": (1.0, 2.0)}, r"drawn has \['mass'\], which are none of \['dt', 'g', "),
             ({"action_space": (1.0, 2.0)}, "which are none of"),
+            ({"spec.mass": (1.0, 2.0)}, r"\['spec.mass'\], which are none of"),
+            ({"action_space.low[1]": (1.0, 2.0)}, "which are none of"),
+            ({"last": (1.0, 2.0)}, r"last has 3 numbers\. Draw one of them, as last\[0\], or give .* a property"),
             ({"m": (2.0, 1.0)}, r"drawn\['m'\]=\(2.0, 1.0\) must be the smallest and the largest value"),
             ({"m": (1.0, np.inf)}, "two finite numbers"),
             ({"m": 1.0}, "two finite numbers"),
@@ -429,7 +434,31 @@ class TestDomainRandomization:
     )
     def test_bad_ranges_are_named(self, drawn, message):
         with pytest.raises(ValueError, match=message):
-            DomainRandomization(gym.make("Pendulum-v1"), drawn)
+            env = gym.make("Pendulum-v1")
+            env.unwrapped.last = np.zeros(3)
+            DomainRandomization(env, drawn)
+
+    def test_numbers_in_arrays_and_nested_objects_are_drawn_by_their_path_and_arrays_by_a_property(self):
+        class Simulated(PendulumEnv):
+            def __init__(self):
+                super().__init__()
+                self.model = SimpleNamespace(mass=np.array([0.0, 1.0, 2.0]), opt={"gravity": [0.0, 0.0, -9.81]})
+
+            @property
+            def factor(self):
+                return self.model.mass[1]
+
+            @factor.setter
+            def factor(self, factor):
+                self.model.mass[:] = factor * np.array([0.0, 1.0, 2.0])
+
+        drawn = {"factor": (0.8, 1.2), "model.opt.gravity[2]": (-11.0, -9.0), "model.mass[0]": (3.0, 4.0)}
+        env = DomainRandomization(Simulated(), drawn)
+        for seed in range(3):
+            values = env.reset(seed=seed)[1]["drawn"]
+            model = env.unwrapped.model
+            np.testing.assert_allclose(model.mass, [values["model.mass[0]"], values["factor"], 2 * values["factor"]])
+            assert model.opt["gravity"] == [0.0, 0.0, values["model.opt.gravity[2]"]]
 
 
 def linear_roll_outs(env, gain, n_episodes, n_steps):

@@ -6,7 +6,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
-from sb3_lac import LAC, LyapunovPolicy, PublishedLAC
+from sb3_lac import LAC, LyapunovPolicy, MlpPolicy, PublishedLAC
 
 
 class BatchNormExtractor(BaseFeaturesExtractor):
@@ -161,7 +161,18 @@ def test_the_root_is_kept_in_files_and_is_one_of_lac_alone(make_model, tmp_path)
         make_model(policy_kwargs={"root": 3})
     with pytest.raises(TypeError, match="root"):
         make_model(algorithm=PublishedLAC, policy_kwargs={"root": 2})
-    # As models of before release 0.7, which had the fourth
-    del model.policy_kwargs["root"]
+    alone = MlpPolicy(model.observation_space, model.action_space, lambda _: 1e-3)
+    assert alone.critic.degree == model.critic.degree
     model.save(tmp_path / "model")
-    assert LAC.load(tmp_path / "model").critic.degree == 4
+    assert LAC.load(tmp_path / "model").critic.degree == 2
+
+
+@pytest.mark.parametrize(("stated", "root"), [({}, 4), ({"root": None}, 4), ({"root": 2}, 2), ({"root": 4}, 4)])
+def test_weights_that_go_with_no_root_are_of_the_fourth_unless_one_was_stated(stated, root, make_model):
+    model = make_model(n_collect=0, policy_kwargs=stated)
+    weights = {name: value for name, value in model.policy.state_dict().items() if not name.endswith("_extra_state")}
+    model.policy.load_state_dict(weights)
+    assert model.critic.degree == model.critic_target.degree == root
+    other = make_model(n_collect=0)
+    other.policy.load_state_dict(model.policy.state_dict())
+    assert other.critic.degree == root

@@ -145,13 +145,19 @@ def test_a_training_without_an_update_is_refused_before_anything_is_written(comm
 
 def test_other_algorithms_and_configs_can_be_chosen(workdir, monkeypatch):
     calls = []
-    monkeypatch.setattr(rl_zoo3.train, "train", lambda: calls.append(sys.argv[1:]))
+    for command in ("train", "enjoy"):
+        monkeypatch.setattr(getattr(rl_zoo3, command), command, lambda: calls.append(sys.argv[1:]))
     main(["train", "--env", ENV])
+    # One that LAC can learn, whose actions are no discrete ones
+    main(["train"])
+    main(["enjoy", "--algo", "published_lac", "-f", "logs"])
     main(["optimize", "--algo=ppo", "-conf", "my.yml", "--env", ENV])
     # One that only the RL Zoo has hyperparameters of
     main(["train", "--algo", "a2c"])
     assert calls == [
         ["--algo", "lac", "--env", ENV, "--conf-file", str(workdir / "zoo_configs" / "lac.yml")],
+        ["--algo", "lac", "--env", "Pendulum-v1", "--conf-file", str(workdir / "zoo_configs" / "lac.yml")],
+        ["-f", "logs", "--algo", "published_lac", "--env", "Pendulum-v1"],
         ["--algo", "ppo", "--env", ENV, "--conf-file", "my.yml", "--optimize-hyperparameters"],
         ["--algo", "a2c", "--env", "CartPole-v1", "--conf-file", str(RL_ZOO_CONFIGS / "a2c.yml")],
     ]

@@ -18,6 +18,7 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.faults import (
     KEPT,
+    MOST_NOISE_SD,
     NOISES,
     RESOLUTION_V,
     SMOOTHED_SHARE,
@@ -29,7 +30,16 @@ from battery_env.estimators.diagnosis.faults import (
 )
 from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, LACKING_SHARE, low_rest_voltage_V, rest_voltage_V
 from battery_env.estimators.reasons import SETTLED_SHARES, Reason
-from battery_env.records import LOAD_SHARE, REST_CURRENT_A, STEADY_S, SWITCH_SHARE, ChargeBefore, ChargeHistory, Samples
+from battery_env.records import (
+    LOAD_SHARE,
+    REST_CURRENT_A,
+    STEADY_S,
+    SWITCH_SHARE,
+    ChargeBefore,
+    ChargeHistory,
+    DischargeStart,
+    Samples,
+)
 from battery_env.records.load import SWITCHES, note_switch, switched_C
 
 # A cell that was at rest at the first sample falls by at least half of its ohmic drop within this time, s. So does one whose
@@ -102,8 +112,12 @@ EVIDENCE = table(
         ("time_s", "f8"),
         ("current_A", "f8"),  # since the last sample
         ("drawn_C", "f8"),
-        ("start_V", "f8"),  # of a cell at rest with the charge expected at the start; NaN: none is
+        ("model_V", "f8"),  # of the model at rest with the charge expected at the start; NaN: none is
+        ("start_V", "f8"),  # of a cell with that charge
         ("low_V", "f8"),  # of one that lacks charge
+        ("high_V", "f8"),  # of another cell
+        ("is_usual", "b1"),  # whether other discharges of the cell tell these voltages: the first ones, under a current of
+        ("usual_A", "f8"),
         ("share_V", "f8"),  # at rest at least, when the share was drawn from which it does not come back; 0: not yet
         ("start", _START),
         ("interval_s", "f8"),  # the last one
@@ -141,7 +155,8 @@ def evidence_of(
     """
     evidence, (q_mobile, r_o) = np.zeros(1, EVIDENCE), estimate
     expect(evidence, cell, initial_soc)
-    take_in(evidence, history)
+    # another charge was stated by whoever knows it
+    take_in(evidence, history if initial_soc == 1.0 else history._replace(usual_start=None))
     time_s, voltage_V, current_A = (np.ascontiguousarray(column) for column in record)
     expected_V = np.empty(0) if model_V is None else model_V
     _watch_all(evidence, time_s, voltage_V, current_A, expected_V, q_mobile, r_o, cell.q_mobile)
@@ -164,9 +179,10 @@ def dropouts_s(record: Samples, cell: CellParameters) -> FloatArray:
 
 def expect(evidence: Any, cell: CellParameters, initial_soc: float | None) -> None:
     """Expect a cell at rest with some charge, before the first sample; ``None``: none."""
-    evidence["start_V"] = evidence["low_V"] = nan
+    evidence["model_V"] = evidence["low_V"] = nan
     if initial_soc is not None:
-        evidence["start_V"], evidence["low_V"] = rest_voltage_V(cell, initial_soc), low_rest_voltage_V(cell, initial_soc)
+        evidence["model_V"], evidence["low_V"] = rest_voltage_V(cell, initial_soc), low_rest_voltage_V(cell, initial_soc)
+    evidence["start_V"], evidence["high_V"] = evidence["model_V"], evidence["model_V"] + ABOVE_REST_V
 
 
 def take_in(evidence: Any, history: ChargeHistory) -> None:
@@ -182,8 +198,28 @@ def take_in(evidence: Any, history: ChargeHistory) -> None:
         is_low = (charge.highest_V < evidence["low_V"]) | (not charge.tapered and history.rest_s < STEADY_S)
         start["charge"] = np.where(np.isnan(full_V), 0, np.where(is_low, -1, int(charge.tapered)))
         evidence["left_C"], start["is_cut_short"] = np.where(np.isnan(full_V), 0.0, charge.left_C), not charge.tapered
+    if history.start is not None and history.usual_start is not None:
+        _expect_usual(evidence, history.start, history.usual_start)
     if history.load_on_C or history.offset_A:
         rest["is_over"], rest["mean_A"], rest["load_on_C"] = True, history.offset_A, history.load_on_C
+
+
+def _expect_usual(evidence: Any, own: DischargeStart, usual: DischargeStart) -> None:
+    """Expect a start like those of other discharges of the cell: its voltage, or its charge if the load is another one."""
+    span_V = evidence["start_V"] - evidence["low_V"]
+    is_like = own.is_charged_like(usual, float(np.max(span_V)))
+    if not own.is_of_current(usual) and is_like is None:
+        return
+    evidence["start_V"], evidence["is_usual"], evidence["usual_A"] = usual.voltage_V, True, usual.current_A
+    if not own.is_of_current(usual):
+        evidence["start"]["charge"], evidence["start"]["is_cut_short"] = 1 if is_like else -1, False
+        evidence["high_V"] = np.inf
+        return
+    spread_V = MOST_NOISE_SD * usual.sd_V
+    evidence["low_V"], evidence["high_V"] = usual.voltage_V - span_V - spread_V, usual.voltage_V + ABOVE_REST_V + spread_V
+    if own.charge is not None:
+        is_low, is_full = own.charge.highest_V < evidence["low_V"], own.charge.tapered and is_like is not False
+        evidence["start"]["charge"] = np.where(is_low, -1, int(is_full))
 
 
 def measured(evidence: Any, initial_soc: float, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
@@ -195,6 +231,7 @@ def measured(evidence: Any, initial_soc: float, clock_s: float = 0.0, charge: Ch
         "first_V": float(evidence["start"]["first_V"]),
         "rest_V": float(evidence["start_V"]),
         "first_A": float(evidence["start"]["first_A"]),
+        "usual_A": float(evidence["usual_A"]),
         "expected": "a full cell" if initial_soc == 1.0 else f"a cell with {initial_soc:.0%} of its charge",
         "charge_V": charge.highest_V,
         "charge_A": charge.last_A,
@@ -365,11 +402,12 @@ def start_reason(evidence: Row) -> int:
     is lower than at rest by a drop that nobody knows: a cell with a larger one cannot be told from one that lacks some charge.
     """
     start = evidence.start
-    if start.first_V > evidence.start_V + ABOVE_REST_V:
+    is_high, is_low = start.first_V > evidence.high_V, start.charge == 0 and start.first_V < evidence.low_V
+    if evidence.is_usual:
+        return Reason.START_UNLIKE + 0 if is_high or is_low or start.charge < 0 else 0
+    if is_high or is_low:
         return Reason.START_DIFFERS + 0
-    if start.charge < 0:
-        return Reason.START_CHARGED + 0
-    return Reason.START_DIFFERS + 0 if start.charge == 0 and start.first_V < evidence.low_V else 0
+    return Reason.START_CHARGED + 0 if start.charge < 0 else 0
 
 
 @compiled

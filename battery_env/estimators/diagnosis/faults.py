@@ -20,6 +20,8 @@ KEPT = 32
 #: A change of more than so many standard deviations of the noise is not noise. The middle one of three samples has this share
 #: of their noise.
 NOISES, SMOOTHED_SHARE = 8.0, 0.67
+#: A voltage farther off than so many standard deviations of its noise shows an error of the model, or of the sensor.
+MOST_NOISE_SD = 3.0
 #: Voltages are rounded, and no model is better than this, V.
 RESOLUTION_V = 1e-3
 # This many changes tell the noise.

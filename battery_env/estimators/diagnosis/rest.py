@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
 from battery_env.estimators.reasons import Reason
-from battery_env.records import REST_CURRENT_A, STEADY_S, Record, Stream
+from battery_env.records import REST_CURRENT_A, STEADY_S, ChargeBefore, DischargeStart, Record, Stream
 
 #: What a state of charge can be given as: a number, or (mean, standard deviation).
 InitialSoc = float | tuple[float, float]
@@ -99,6 +100,29 @@ def soc_from_rest(
     sd_V = np.hypot(np.hypot(sensor_sd_V, model_sd_V), _STILL_TO_COME * (fast_V - slow_V))
     rest_s = float(stream.time_s[count - 1] - stream.time_s[0])
     return Start(soc, float(sd_V / slope_V), count, "" if rest_s >= STEADY_S else Reason.START_UNKNOWN.text)
+
+
+def starting_alike(records: Sequence[Record]) -> list[Record]:
+    """Those of some discharges of a cell, each a record from load-on, that start alike, if these are most of them."""
+    starts = [DischargeStart.of(record) for record in records]
+    groups = [[n for n, each in enumerate(starts) if _is_like(each, other)] for other in starts]
+    largest = max(groups, key=len, default=[])
+    return [records[n] for n in largest] if 2 * len(largest) > len(records) else []
+
+
+def usual_start(records: Sequence[Record]) -> DischargeStart | None:
+    """How most discharges of a cell start, which is what counts as full of it; ``None`` if they do not start alike."""
+    starts = [DischargeStart.of(record) for record in starting_alike(records)]
+    if not starts:
+        return None
+    voltages_V, charges = [each.voltage_V for each in starts], [each.charge for each in starts if each.charge is not None]
+    charge = ChargeBefore._make(np.median(charges, axis=0).tolist()) if len(charges) == len(starts) else None
+    return DischargeStart(float(np.mean(voltages_V)), starts[0].current_A, float(np.std(voltages_V)), charge)
+
+
+def _is_like(start: DischargeStart, other: DischargeStart) -> bool:
+    is_like = start.is_of_current(other) and abs(start.voltage_V - other.voltage_V) <= BELOW_REST_V
+    return is_like and start.is_charged_like(other, BELOW_REST_V) is not False
 
 
 def _running_mean_V(stream: Stream, count: int, memory_s: float) -> float:

@@ -31,12 +31,11 @@ from battery_env.electrochemistry.tangents import (
     voltage_tangents,
 )
 from battery_env.estimators.diagnosis.evidence import unseen_C
-from battery_env.estimators.diagnosis.faults import KEPT, Row
+from battery_env.estimators.diagnosis.faults import KEPT, MOST_NOISE_SD, Row
 from battery_env.estimators.kalman.state import FILTER, OFFSET, FilterSettings, Q, R
 from battery_env.estimators.reasons import Reason
 from battery_env.estimators.verdict import (
     MISMATCH_MARGIN,
-    MOST_NOISE_SD,
     PRIOR_LIMIT_SD,
     is_plausible,
     judge,
@@ -136,7 +135,7 @@ def _predict(one: Row, current: float, duration: float, settings: FilterSettings
 @inlined
 def _mismatch_V2(evidence: Row, settings: FilterSettings) -> float:
     # The model is no better than the voltage at rest shows, beyond noise.
-    start_V2 = (evidence.start.first_V - evidence.start_V) ** 2 - MOST_NOISE_SD**2 * settings.noise_V2
+    start_V2 = (evidence.start.first_V - evidence.model_V) ** 2 - MOST_NOISE_SD**2 * settings.noise_V2
     return start_V2 if start_V2 > settings.mismatch_V2 else settings.mismatch_V2
 
 

@@ -25,7 +25,7 @@ from battery_env.estimators.kalman.state import CELL, FILTER, SAMPLE, FilterSett
 from battery_env.estimators.reasons import Reason
 from battery_env.estimators.verdict import JUDGED, Assumptions, Verdict
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
-from battery_env.records import ChargeBefore, Record, Stream, check_drawn_charge, check_sample, history_of
+from battery_env.records import ChargeBefore, DischargeStart, Record, Stream, check_drawn_charge, check_sample, history_of
 
 #: How far cells of one nominal capacity may lie from it, new and worn: the standard deviation, as a share.
 PRIOR_SD_SHARE_Q = 0.25
@@ -106,6 +106,8 @@ class ExtendedKalmanFilter(OnlineEstimator):
     :param initial_soc: state of charge at the first sample, after a rest: a number, or (mean, standard deviation), which adds
         to that of ``q_mobile``
     :param cell_sd_r_o_ohm: what the constants leave open of ``r_o``: its standard deviation by theirs, ohm
+    :param usual_start: how other discharges of the cell start, which :meth:`follow` compares records with; ``None``: as a full
+        cell of the model rests
     :raises ValueError: for an argument out of range
     """
 
@@ -125,6 +127,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         current_gain_sd: float = 0.0,
         initial_soc: float | tuple[float, float] = 1.0,
         cell_sd_r_o_ohm: float = 0.0,
+        usual_start: DischargeStart | None = None,
     ) -> None:
         self.parameters = check_parameters(parameters)
         self.cell = check_cell(cell, thermal)
@@ -136,6 +139,7 @@ class ExtendedKalmanFilter(OnlineEstimator):
         voltage_noise_V = _checked_noise_V(voltage_noise_V, mismatch_V)
         self.current_gain_sd = check_gain_sd(current_gain_sd)
         self.initial_soc = check_initial_soc(initial_soc)
+        self.usual_start = usual_start
         q, q_sd = self._prior("q_mobile", prior_q_mobile_C, PRIOR_SD_SHARE_Q * self.cell.q_mobile)
         r_o, r_o_sd = self._prior("r_o", prior_r_o_ohm, _PRIOR_SD_R_OHM * NEW_CELL.q_mobile / self.cell.q_mobile)
         self._means, self._sds = (q, r_o), (q_sd, r_o_sd, float(offset_sd_V))
@@ -244,9 +248,9 @@ class ExtendedKalmanFilter(OnlineEstimator):
         samples["temperature_K"] = nan if temperature_C is None else temperature_C + ZERO_CELSIUS_K
         if temperature_C is not None:
             self._begin(float(samples["temperature_K"][0]))
-        history = history_of(record)
+        history = history_of(record, self.usual_start)
         if self.initial_soc[0] < 1.0:
-            history = history._replace(charge=None)
+            history = history._replace(charge=None, usual_start=None)
         take_in(self._cell["evidence"], history)
         check_drawn_charge(float(np.cumsum(np.append(0.0, current_A[:-1]) * dt_s).min()), self.least_drawn_C)
         judged, said = self._follow(samples), self._measured(float(time_s[0]), history.charge)

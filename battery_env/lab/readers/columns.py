@@ -26,6 +26,8 @@ _TIMES = _units(
     {
         "s sec secs second seconds": 1.0,
         "ms millisecond milliseconds": 1e-3,
+        "us \u03bcs microsecond microseconds": 1e-6,
+        "ns nanosecond nanoseconds": 1e-9,
         "min mins minute minutes": 60.0,
         "h hr hrs hour hours": 3600.0,
         "d day days": 86400.0,

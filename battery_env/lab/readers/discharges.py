@@ -25,6 +25,7 @@ from battery_env.lab.readers.testers import Tester, find_tester
 from battery_env.records import (
     LEAST_LOAD_SHARE,
     LOAD_SHARE,
+    STEADY_S,
     SWITCH_SHARE,
     ChargeBefore,
     ChargeHistory,
@@ -35,7 +36,7 @@ from battery_env.records.discharge import LEAST_SAMPLES, Discharge
 
 Made = TypeVar("Made")
 
-# A stretch of charging ends a discharge if it returns more than this share of the charge drawn until then; less is braking.
+# A charge ends a discharge if it returns more than this share of the charge drawn until then; less is braking, or is told.
 _RETURNED_SHARE = 0.2
 # A charge before the load is cut off if it exceeds this share of the charge drawn; a smaller one is sensor offset. A charge
 # within the load ends the discharge only if it returns more than this share of the largest charge drawn: early pulses return
@@ -196,32 +197,22 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], vain: frozenset[str]) -> li
     parts = [part for low, high in itertools.pairwise(_bounds(rows)) for part in _discharges(rows, low, high)]
     if not parts:
         raise ValueError("there is no discharge: no charge is drawn. Check the sign of the current")
-    current_A = rows["current"].to_numpy()
-    drawn_C = np.array([part.drawn_C for part in parts])
+    current_A, places = rows["current"].to_numpy(), rows.index + 1
     # what no cell can draw is refused later, and is no measure of the others
-    of_cells = [current_A[part.rows].max() <= LOAD_LIMITS["current"] for part in parts]
-    is_small = drawn_C < LOAD_SHARE * drawn_C[of_cells].max(initial=0.0)
-    _say_left_aside(rows, [part for part, small in zip(parts, is_small, strict=True) if small], float(drawn_C.max()))
-    parts = [part for part, small in zip(parts, is_small, strict=True) if not small]
-    several = len(parts) > 1
-    found = []
-    for number, part in enumerate(parts, start=1):
-        history = ChargeHistory(charge=_charge_before(rows, part.charge))
-        numbered = meta | ({"cycle": number} if several else {})
-        found.append(_recording(rows.iloc[part.rows], history, numbered, several, vain))
-    return found
-
-
-def _say_left_aside(rows: pd.DataFrame, parts: list[_Part], most_C: float) -> None:
-    """Name what is no discharge; what draws next to nothing is noise of a sensor."""
-    named = [part for part in parts if part.drawn_C > NOTHING_SHARE**2 * most_C]
-    if named:
-        first = "; ".join(
-            f"{drawn_C / 3600.0:.3g} Ah in rows {rows.index[part.start] + 1} to {rows.index[part.stop - 1] + 1}"
-            for part, drawn_C, _ in named[:3]
-        )
-        more = " and others" if len(named) > 3 else ""
-        say(f"left aside, as they draw less than {LOAD_SHARE:.0%} of the largest: {len(named)} ({first}{more})")
+    largest_C = max((part.drawn_C for part in parts if current_A[part.rows].max() <= LOAD_LIMITS["current"]), default=0.0)
+    aside = [
+        f"{drawn_C / 3600.0:.3g} Ah in rows {places[part.start]} to {places[part.stop - 1]}"
+        for part, drawn_C, _ in parts
+        if NOTHING_SHARE**2 * largest_C < drawn_C < LOAD_SHARE * largest_C  # next to nothing is noise of a sensor
+    ]
+    if aside:
+        first = "; ".join(aside[:3]) + (" and others" if len(aside) > 3 else "")
+        say(f"left aside, as they draw less than {LOAD_SHARE:.0%} of the largest: {len(aside)} ({first})")
+    parts = [part for part in parts if part.drawn_C >= LOAD_SHARE * largest_C]
+    histories = [ChargeHistory(charge=_charge_before(rows, part.charge)) for part in parts]
+    metas = [meta | {"cycle": number} for number in range(1, len(parts) + 1)] if len(parts) > 1 else [meta]
+    found = zip(parts, histories, metas, strict=True)
+    return [_recording(rows.iloc[part.rows], history, each, len(parts) > 1, vain) for part, history, each in found]
 
 
 def _bounds(rows: pd.DataFrame) -> list[int]:
@@ -230,7 +221,7 @@ def _bounds(rows: pd.DataFrame) -> list[int]:
     no charge is logged, and the voltage is back after it fell: counters may count loops.
     """
     time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
-    are_charges_logged = any(charge.is_end for charge in _charges(current_A, _passed_C(time_s, current_A)))
+    are_charges_logged = any(charge.is_end for charge in _charges(rows, _passed_C(time_s, current_A)))
     bounds, numbers = [0], [0, *np.flatnonzero(changes(rows, "cycle")), len(rows)]
     of_cell, top_V = True, -np.inf
     for begin, end in itertools.pairwise(numbers):
@@ -256,7 +247,7 @@ def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[_Part]:
     time_s, current_A = (rows[name].to_numpy()[low:high] for name in ("time", "current"))
     passed_C = _passed_C(time_s, current_A)
     groups: list[list[_Charge]] = [[]]
-    for charge in _charges(current_A, passed_C):
+    for charge in _charges(rows[low:high], passed_C):
         groups += [[]] if charge.is_end else []
         groups[-1].append(charge)
     begins = [0, *(group[0].start for group in groups[1:]), high - low]
@@ -286,18 +277,29 @@ class _Charge(NamedTuple):
     is_braking: bool  # which returns less than was drawn, and ends none
 
 
-def _charges(current_A: FloatArray, passed_C: FloatArray) -> list[_Charge]:
-    """Where the cell is charged, noise at rest left aside."""
+def _charges(rows: pd.DataFrame, passed_C: FloatArray) -> list[_Charge]:
+    """Where the cell is charged between two loads, in as many steps as there are; noise at rest is left aside."""
+    time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
+    state, cycle = (rows[each].to_numpy() if each in rows else 0.0 * time_s for each in ("state", "cycle"))
+    loaded = np.flatnonzero(current_A > LEAST_LOAD_SHARE * current_A.max())
+    is_strong = current_A < LEAST_LOAD_SHARE * current_A.min()
     charging = np.concatenate([[False], current_A < 0.0, [False]])
     starts, ends = np.flatnonzero(~charging[:-1] & charging[1:]), np.flatnonzero(charging[:-1] & ~charging[1:])
     counts = passed_C[starts] - passed_C[ends - 1] > NOTHING_SHARE * float(np.ptp(passed_C))
+    n = np.searchsorted(loaded, starts[counts])
+    starts, ends = starts[counts][np.diff(n, prepend=-1) > 0], ends[counts][np.diff(n, append=len(rows) + 1) > 0]
     least_C = _CHARGED_SHARE * float((passed_C - np.minimum.accumulate(passed_C)).max())
     found, lowest_C, highest_C = [], passed_C[0], passed_C[0]
-    for start, end in zip(starts[counts].tolist(), ends[counts].tolist(), strict=True):
+    for start, end, after in zip(starts.tolist(), ends.tolist(), np.unique(n).tolist(), strict=True):
         drawn_C, highest_C = passed_C[start] - lowest_C, max(highest_C, passed_C[start])
         returned_C = passed_C[start] - passed_C[end - 1]
-        # a charge may be logged in many steps, of which each returns little
-        is_end = drawn_C > 0.0 and returned_C > _RETURNED_SHARE * drawn_C and highest_C - passed_C[end - 1] > least_C
+        is_end = returned_C > _RETURNED_SHARE * drawn_C and highest_C - passed_C[end - 1] > least_C
+        strong = start + np.flatnonzero(is_strong[start:end])  # less is an offset at rest
+        if after and len(strong) and returned_C > least_C:
+            before = loaded[after - 1]
+            is_end |= state[strong].mean() < 0.0 or time_s[strong[0] - 1] - time_s[before] > STEADY_S
+            is_end |= (cycle[loaded[after : after + 1]] != cycle[before]).any()
+        is_end &= drawn_C > 0.0
         found.append(_Charge(start, end, bool(is_end), bool(not is_end and returned_C < drawn_C)))
         lowest_C = passed_C[start] if is_end else lowest_C
         if passed_C[end - 1] < lowest_C:

@@ -1,11 +1,10 @@
 """
 The rows of a table as a record has them: in SI units, in their order, on one clock. Three things are mended, and said: a clock
-that goes back where there are dates, incomplete rows, and two rows at one time. What else is odd is refused with its rows.
+that goes back at midnight or beside dates, unusable rows, and two rows at one time. What else is odd is refused with its rows.
 """
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -14,10 +13,12 @@ import numpy as np
 import pandas as pd
 
 from battery_env.arrays import BoolArray, FloatArray
+from battery_env.checks import check_real
 from battery_env.lab.readers.columns import Column, FileFormat, Recognised, direction, say
 from battery_env.lab.readers.testers import REQUIRED
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, switches
 from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES
+from battery_env.records.samples import PLAUSIBLE
 
 #: What is worth less than this share of the charge is nothing.
 NOTHING_SHARE = 1e-3
@@ -25,8 +26,6 @@ NOTHING_SHARE = 1e-3
 FEW_SHARE = 0.01
 # Two rows of different steps may have the same time; the second counts as so much later, s.
 _STEP_S = 1e-3
-# Days as in 1-02:03:04, 1.02:03:04, or 1 day, 2:03:04.
-_DAYS = re.compile(r"^(\d+)(?:[-.]| days?,? )(?=\d+:)")
 _DATES: tuple[dict[str, Any], ...] = ({"format": "ISO8601"}, {}, {"dayfirst": True})
 
 
@@ -35,16 +34,17 @@ def rows_of(table: pd.DataFrame, known: Recognised, file_format: FileFormat) -> 
     The rows of a table with columns by quantity as they were written, whose index counts the rows below the header, in SI
     units, and in order; the current has the sign of the file.
     """
-    if len(table) < LEAST_SAMPLES:
-        raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows below the header, got {len(table)}")
     rows = with_current(on_its_clock(in_si_units(table, known), known.columns), known.columns, file_format)
     return in_order(without_incomplete(rows))
 
 
-def place_of(rows: pd.DataFrame, which: BoolArray | pd.Series[bool]) -> str:
-    """The first of some rows as a file counts them, and how many more there are."""
-    places = rows.index[which]
-    return f"{places[0] + 1}" + (f" and {len(places) - 1} more" if len(places) > 1 else "")
+def place_of(rows: pd.DataFrame, which: BoolArray | pd.Series[bool], most: int = 10) -> str:
+    """Some rows as a file counts them: so many stretches of them at most, and how many rows there are."""
+    places = rows.index[which].to_numpy() + 1
+    parts = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
+    named = ", ".join(f"{part[0]}" if len(part) == 1 else f"{part[0]} to {part[-1]}" for part in parts[:most])
+    more = " and others" if len(parts) > most else ""
+    return f"{named}{more} ({len(places)} rows)" if len(places) > 1 else named
 
 
 def in_si_units(table: pd.DataFrame, known: Recognised) -> pd.DataFrame:
@@ -75,6 +75,7 @@ def _check_twins(found: Mapping[str, FloatArray], columns: Mapping[str, Column])
 
 def numbers(values: pd.Series, column: Column) -> FloatArray:
     """Numbers in SI units, NaN where there is none; refused if words stand in more than a few rows."""
+    check_real(f"the column {column.name!r}", values)
     if not pd.api.types.is_numeric_dtype(values.dtype):
         found = pd.to_numeric(values.astype(object), errors="coerce").astype(np.float64)
         _check_readable(values, found.isna(), column, "numbers")
@@ -126,26 +127,27 @@ def _one_cell(values: pd.Series, column: Column) -> FloatArray:
 
 
 def seconds(values: pd.Series, column: Column) -> FloatArray:
-    """
-    Numbers in their unit; a clock, hours:minutes:seconds, in seconds; dates in seconds since 1970. Blanks, and words in a few
-    rows, are NaN.
-    """
+    """Times in s, those of dates since 1970: numbers, hours:minutes:seconds, or dates; blanks, and a few words, are NaN."""
     if pd.api.types.is_datetime64_any_dtype(values.dtype) or pd.api.types.is_timedelta64_dtype(values.dtype):
         return _total_s(values)
-    if pd.api.types.is_numeric_dtype(values.dtype):
-        found = numbers(values, column)
-        if not np.isfinite(found).any() or np.nanmin(found) < 1e13:
-            return found
-        # dates in digits, as 20260227225000
-        return _total_s(pd.to_datetime(values.astype("Int64").astype("string"), format="%Y%m%d%H%M%S", errors="coerce"))
-    text = values.astype("string").str.strip().replace({"": pd.NA})
+    is_number = pd.api.types.is_numeric_dtype(values.dtype)
+    text = pd.Series(dtype="string") if is_number else values.astype("string").str.strip().replace({"": pd.NA})
     if 2 * text.str.contains(":").sum() <= text.notna().sum():
-        return numbers(values, column)
+        found = numbers(values, column)
+        digits = len(f"{pd.Series(found).median():.0f}")
+        if digits == 14:  # a date, as 20260227225000
+            text = pd.Series(found).round().astype("Int64").astype("string")
+            return _total_s(pd.to_datetime(text, format="%Y%m%d%H%M%S", errors="coerce"))
+        # since 1970, in ms, us or ns
+        return found * 10.0 ** (10 - digits) if digits in (13, 16, 19) else found
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a day that is no month
+        text = text.str.replace(r",(?=\d+$)", ".", regex=True)
         readings: list[pd.Series] = [pd.to_timedelta(text, errors="coerce")]
         if (readings[0] >= pd.Timedelta(0)).sum() < text.notna().sum():
-            text = text.str.replace(r"(?<=\d),(?=\d)", ".", regex=True).str.replace(_DAYS, r"\1 days ", regex=True)
+            # days and dates stand before a clock as in 1-02:03:04, 1 day, 2:03:04, and 2026-02-27,22:50:00
+            text = text.str.replace(r"(?<=\d)[^\d:]+(?=\d+:)", " ", n=1, regex=True)
+            text = text.str.replace(r"^(\d+) (?=\d+:)", r"\1 days ", regex=True)
             readings = [pd.to_timedelta(text, errors="coerce")]
         if readings[0].isna().mean() > 0.5:
             # UTC, as the clocks of a time zone are put forward and back
@@ -176,7 +178,13 @@ _READ: dict[str, Callable[[pd.Series, Column], FloatArray]] = {
 
 
 def on_its_clock(rows: pd.DataFrame, columns: Mapping[str, Column]) -> pd.DataFrame:
-    """With the times of the test; where these go back, or are not there, with the dates if these do not."""
+    """With the times of the test; where these go back other than at midnight, or are not there, with the dates."""
+    for clock in [each for each in ("time", "date") if each in rows]:
+        step_s, day_s = rows[clock].ffill().diff(), CLOCKS["days"][1]
+        is_new = (step_s < 0.0) & (step_s + day_s).between(0.0, min(2.0 * step_s.max(), 0.5 * day_s))
+        if is_new.any():  # just where a day is over
+            say(f"the time of day {columns[clock].name!r} passes midnight: a day more from row {place_of(rows, is_new)} on")
+            rows = rows.assign(**{clock: rows[clock] + day_s * is_new.cumsum()})
     if "time" in rows and "date" in rows and _goes_back(rows, "time") and not _goes_back(rows, "date"):
         say(f"the time is {columns['date'].name!r}, as {columns['time'].name!r} goes back")
         rows = rows.drop(columns="time")
@@ -224,22 +232,26 @@ def with_current(rows: pd.DataFrame, columns: Mapping[str, Column], file_format:
 def without_incomplete(rows: pd.DataFrame) -> pd.DataFrame:
     """
     Without rows that hold no measurement, as blanks, titles, headers that come again, and those at the ends in which no cell
-    is connected; and without a few in which the time, the voltage or the current is missing.
+    is connected; and without a few in which the time, the voltage or the current is missing, or none that a cell has.
     """
     is_known = np.isfinite(rows[list(REQUIRED)])
     rest_A = min(REST_CURRENT_A, NOTHING_SHARE * rows["current"].abs().max())  # which a small cell yields in full
     is_no_cell = (rows["voltage"] < 0.1 * rows["voltage"].median()) & (rows["current"].abs() <= rest_A)
     is_measured = is_known.any(axis=1) & ~(is_no_cell & (is_no_cell.cummin() | is_no_cell[::-1].cummin()))
-    is_missing = ~is_known.all(axis=1) & is_measured
-    for name in REQUIRED:
-        bad = ~is_known[name] & is_missing
-        if bad.any() and is_missing.sum() > max(2, FEW_SHARE * len(rows)):
-            raise ValueError(f"the {name} must be finite, got {rows[name][bad].iloc[0]} in row {place_of(rows, bad)}")
-        if bad.any():
-            say(f"left out, as the {name} is missing: row {place_of(rows, bad)}")
-    if not is_measured.all():
-        say(f"left out, as they hold no measurement of a cell: row {place_of(rows, ~is_measured)}")
-    kept = rows[is_measured & ~is_missing]
+    faults = {f"the {name} is missing": ~is_known[name] & is_measured for name in REQUIRED}
+    for name, (low, high, unit, _) in zip(("voltage", "current"), PLAUSIBLE.values(), strict=False):
+        size, is_of_cell = rows[name].abs(), rows[name].between(low, high)
+        beyond = is_known[name] & ~is_of_cell & (size > 10.0 * size[is_of_cell].max())
+        if 10 * beyond.sum() <= len(rows):  # many, or near ones, are of another unit
+            faults[f"the {name} lies beyond {low:g} .. {high:g} {unit}"] = beyond
+    is_faulty, most = np.any([*faults.values()], axis=0), max(2, int(FEW_SHARE * len(rows)))
+    faults["there is no measurement of a cell"] = ~is_measured
+    told = "; ".join(f"{fault} in row {place_of(rows, bad)}" for fault, bad in faults.items() if bad.any())
+    if is_faulty.sum() > most:
+        raise ValueError(f"{told}. Of {len(rows)} rows at most {most} are left out: remove these, or fill them in")
+    if told:
+        say(f"left out, as {told}")
+    kept = rows[is_measured & ~is_faulty]
     if len(kept) < LEAST_SAMPLES:
         raise ValueError(f"a discharge needs {LEAST_SAMPLES} rows with a time, a voltage and a current, got {len(kept)}")
     return kept
@@ -252,9 +264,8 @@ def changes(rows: pd.DataFrame, name: str) -> BoolArray:
 
 def in_order(rows: pd.DataFrame) -> pd.DataFrame:
     """
-    Of two rows at one time, between which the step changes or the load is switched, the second is the later one; others are
-    left out, if they are few. A clock that goes back is refused, but where the number of the cycle changes, which may have its
-    own.
+    Of two rows at one time the second is later where the step changes or the load is switched; others are left out, if few. A
+    clock that goes back is refused, but where the number of the cycle changes, which may have its own.
     """
     time_s = rows["time"].to_numpy()
     step_s = np.diff(time_s, prepend=np.nan)

@@ -21,20 +21,24 @@ def call(command, *arguments):
     return ended.value.code
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_says_how_the_command_is_called_and_an_argument_that_there_is_not_is_refused(command, capsys):
-    assert call(command, "--help") == 0
-    assert f"usage: python -m benchmarks.{command}" in capsys.readouterr().out
-    assert call(command, "--no-such-option") == 2
-    assert f"python -m benchmarks.{command}: error: " in capsys.readouterr().err
+def test_help_says_how_a_command_is_called(capsys):
+    for command in COMMANDS:
+        assert call(command, "--help") == 0
+        assert f"usage: python -m benchmarks.{command}" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("out", ["file", "file/below"])
-@pytest.mark.parametrize("command", [command for command in COMMANDS if command not in (*STUDIES, "demo")])
-def test_a_folder_that_cannot_be_is_refused(command, out, tmp_path, capsys):
+def test_an_argument_that_there_is_not_is_refused(capsys):
+    for command in COMMANDS:
+        assert call(command, "--no-such-option") == 2
+        assert f"python -m benchmarks.{command}: error: " in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_is_refused(tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    assert call(command, "--out", str(tmp_path / out)) == 2
-    assert "is a file: choose another --out" in capsys.readouterr().err
+    for command in (command for command in COMMANDS if command not in (*STUDIES, "demo")):
+        for out in ("file", "file/below"):
+            assert call(command, "--out", str(tmp_path / out)) == 2
+            assert "is a file: choose another --out" in capsys.readouterr().err, command
 
 
 #: What all commands say of a number that is none, by what was given, and where
@@ -56,11 +60,11 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize(("words", "line"), [(words, line) for words, lines in REFUSED.items() for line in lines])
-def test_what_a_study_cannot_use_is_refused(words, line, tmp_path, capsys):
-    assert call(line, "--out", str(tmp_path / "out")) == 2
-    *_, option, given = line.split()
-    error = capsys.readouterr().err
-    assert f"{words} {given}" in error or f"{words} '{given}'" in error
-    assert not option.startswith("-") or f"argument {option}: " in error
-    assert not (tmp_path / "out").exists()
+def test_what_a_study_cannot_use_is_refused(tmp_path, capsys):
+    for words, line in [(words, line) for words, lines in REFUSED.items() for line in lines]:
+        assert call(line, "--out", str(tmp_path / "out")) == 2, line
+        *_, option, given = line.split()
+        error = capsys.readouterr().err
+        assert f"{words} {given}" in error or f"{words} '{given}'" in error
+        assert not option.startswith("-") or f"argument {option}: " in error
+        assert not (tmp_path / "out").exists()
