@@ -17,10 +17,8 @@ help:  ## list the commands
 # pip has much to say: it is shown only if the command fails
 logged = ($(1)) > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log >&2; exit 1; }
 comma := ,
-$(VENV)/.installed: BATTERY_ENV := ./battery_env[cyclers]
 $(VENV)/.installed: EXTRAS := zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs
 # what the demo needs; after make install it needs nothing more
-$(VENV)/.demo: BATTERY_ENV := ./battery_env
 $(VENV)/.demo: EXTRAS := zoo$(comma)demo
 # without the RL Zoo, which needs a newer Stable-Baselines3
 OLDEST_EXTRAS := peers$(comma)onnx$(comma)dev$(comma)docs
@@ -35,7 +33,7 @@ $(VENV)/.installed $(VENV)/.demo: setup.cfg pyproject.toml battery_env/setup.cfg
 	@echo "installing $(TORCH)"
 	@$(call logged,$(BIN)/python -m pip install $(addprefix --index-url ,$(TORCH_INDEX)) "$(TORCH)")
 	@echo "installing battery_env and sb3_lac, with the extras $(EXTRAS)"
-	@$(call logged,$(BIN)/python -m pip install --editable '$(BATTERY_ENV)' --editable ".[$(EXTRAS)]")
+	@$(call logged,$(BIN)/python -m pip install --editable "./battery_env[cyclers]" --editable ".[$(EXTRAS)]")
 	@touch $@
 
 install: $(VENV)/.installed  ## make .venv with everything in it
