@@ -101,13 +101,6 @@ def test_commands_of_the_calibrator_run_and_exit_as_their_page_says(tmp_path, mo
         assert calibrate(words[1:]) == int(status[1] if status else 0), line
 
 
-def test_the_first_page_shows_what_the_calibrator_prints(capsys):
-    text = (DOCS / "first_discharge.md").read_text(encoding="utf-8")
-    (shown,) = re.findall(r"^```(?:text)?\n(B0005_100: .*?)^```", text, flags=re.MULTILINE | re.DOTALL)
-    assert calibrate(["B0005:100"]) == 0
-    assert capsys.readouterr().out.strip() == shown.strip()
-
-
 def test_reasons_can_be_looked_up_by_their_own_words():
     text = (DOCS / "real_cells.md").read_text(encoding="utf-8")
     named = [words for row in re.findall(r"^\| (\".*?) \|", text, flags=re.MULTILINE) for words in re.findall('"(.*?)"', row)]
@@ -123,10 +116,10 @@ def test_the_first_screen_names_the_interval_that_its_block_prints(capsys):
     assert f"lies within {shown[0]} to {shown[1]} s" in page.read_text(encoding="utf-8")
 
 
-#: Figures with numbers in their titles: the page that shows each, and what the command of the page writes.
+#: Figures with numbers in their titles: the page that shows each, what its command writes, and whether the page has the text.
 FIGURES = sweep(
-    ("first_discharge.png", "first_discharge.md", "results/B0005_100_voltage.png"),
-    ("own_cell.png", "own_cell.md", "my_cell_fit.png"),
+    ("first_discharge.png", "first_discharge.md", "results/B0005_100_voltage.png", True),
+    ("own_cell.png", "own_cell.md", "my_cell_fit.png", False),
 )
 
 
@@ -135,12 +128,15 @@ def title_of(path):
         return picture.text["Title"]
 
 
-@pytest.mark.parametrize(("figure", "page", "written"), FIGURES)
-def test_the_titles_of_a_figure_are_those_that_the_command_of_its_page_writes(figure, page, written, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("figure", "page", "written", "is_printed"), FIGURES)
+def test_the_command_of_a_page_prints_what_it_shows_and_writes_its_figure(
+    figure, page, written, is_printed, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     command = next(block for block in blocks(DOCS / page, "bash") if "battery-calibrate" in block).splitlines()[0]
     calibrate(shlex.split(command, comments=True)[1:])
     assert title_of(DOCS / "pictures" / figure) == title_of(written)
+    assert not is_printed or blocks(DOCS / page, "text")[0].strip() in capsys.readouterr().out
 
 
 @pytest.mark.attacks
