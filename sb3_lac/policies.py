@@ -17,10 +17,6 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
-#: Root of ``L`` that critics of ``LAC`` learn, unless another one is asked for.
-DEFAULT_ROOT = 2
-
-
 def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
     """The conservative one of several critics."""
     return reduce(th.maximum, values)
@@ -179,7 +175,7 @@ class RootCritic(LyapunovCritic):
             raise ValueError(f"root={root} must be 2, of the square root, or 4, of the fourth root.")
         super().__init__(*args, **kwargs)
         self._stated_root = root
-        self.degree = DEFAULT_ROOT if root is None else root
+        self.degree = 2 if root is None else root
         # What all values have in common. Set by the algorithm, saved with the weights
         self.floor: th.Tensor
         self.register_buffer("floor", th.zeros(1))
