@@ -189,8 +189,8 @@ AT_RELEASE = {
     "battery_env": {"lines": 18_328, "numbers at the top of modules": 192, "starred calls": 44},
     "sb3_lac": {"lines": 6_892, "numbers at the top of modules": 21, "starred calls": 39},
     "benchmarks": {"lines": 6_202},
-    "tests": {"lines": 16_700},
-    "checks": {"lines": 850},
+    "tests": {"lines": 16_773},
+    "checks": {"lines": 819},
 }
 AIR = 0.03
 
