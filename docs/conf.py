@@ -45,7 +45,8 @@ autodoc_type_aliases = {name: name for name in ("BoolArray", "FloatArray", "IntA
 
 # the pages below a page in the sidebar
 BELOW = {
-    "lac": ("how_lac_works", "stability_metrics", "published_lac"),
+    "lac": ("how_lac_works", "custom_policy", "stability_metrics", "published_lac"),
+    "own_problem": ("own_env",),
     "train_fast": ("zoo", "tensorboard", "onnx", "own_algorithm", "cluster"),
     "cost_environments": tuple(f"environments/{env_id}" for env_id in CONTROL_IDS),
     "real_cells": ("tester_files", "own_cell", "forecasts", "streaming", "pretrained"),
@@ -71,14 +72,19 @@ def nest(app: Sphinx, docname: str, source: list[str]) -> None:
 SOUGHT = {
     "battery_env": ("Gymnasium",),
     "cell_life": ("capacity fade", "remaining useful life", "state of health, SOH"),
+    "command_line": ("cut-off",),
     "cost_environments": ("disturbances",),
+    "custom_policy": ("custom policy, features extractor",),
     "faq": ("LFP", "NMC", "pack, packs"),
     "forecasts": ("forecast", "end of discharge"),
     "judge_any_loop": ("stability", "certificate", "Lyapunov function"),
+    "lac": ("save and load",),
     "onnx": ("ONNX", "deployment"),
+    "own_env": ("gym.Env, own environment",),
     "own_problem": ("domain randomization",),
     "parameters": ("capacity", "DCIR, HPPC", "EIS, impedance", "internal resistance"),
-    "real_cells": ("settled",),
+    "real_cells": ("cut-off", "settled", '"not known to 2 %"'),
+    "several_environments": ("several environments", "SubprocVecEnv, make_vec_env"),
     "streaming": ("BMS", "Kalman filter"),
     "tensorboard": ("wandb, Weights & Biases",),
     "tester_files": ("Arbin, Maccor, Neware, BioLogic", "CSV, Excel, Parquet"),

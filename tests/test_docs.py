@@ -14,7 +14,7 @@ from sb3_lac.stability import fitting
 from tests.sweeps import sweep
 
 # What an example needs that no installation for the tests has: it is skipped there.
-OPTIONAL = {"compare_with_pybop.py": ("pybop",)}
+OPTIONAL = {"compare_with_pybop.py": ("pybop",), "control_a_pc_gym_reactor.py": ("pcgym",)}
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 OF_DOCSTRINGS = docstring_examples()
 
