@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from sb3_lac.buffers import Samples
 from sb3_lac.compiled import Metrics, polyak_update, set_gradients, step
-from sb3_lac.costs import CostAlgorithm
+from sb3_lac.cost_algorithm import CostAlgorithm
 from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy, RootCritic, largest_value
 
 

@@ -12,8 +12,9 @@ from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
 from sb3_lac.buffers import HorizonReplayBuffer, Samples
+from sb3_lac.checks import check_rate
 from sb3_lac.compiled import Metrics, polyak_update, set_gradients, step
-from sb3_lac.costs import CostAlgorithm, check_rate
+from sb3_lac.cost_algorithm import CostAlgorithm
 from sb3_lac.policies import PublishedCnnPolicy, PublishedMultiInputPolicy, PublishedPolicy, largest_value
 
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 from torch.torch_version import TorchVersion
 
-from sb3_lac import LAC, PublishedLAC, compiled, costs
+from sb3_lac import LAC, PublishedLAC, compiled, cost_algorithm
 from tests.sweeps import sweep
 
 
@@ -116,7 +116,7 @@ def test_compiled_and_eager_updates_are_the_same(make_model, make_env, monkeypat
     from torch._inductor import config
 
     monkeypatch.setattr(compiled, "BACKEND", backend)
-    monkeypatch.setattr(costs, "check_compiler", lambda device: None)  # other code to wait for
+    monkeypatch.setattr(cost_algorithm, "check_compiler", lambda device: None)  # other code to wait for
     kwargs = kwargs.copy()
     kwargs["env"] = kwargs.pop("wrapper", lambda env: env)(make_env())
     eager, eager_logged = trained(make_model(**kwargs))
