@@ -13,6 +13,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
 from stable_baselines3.common.vec_env import VecNormalize
@@ -27,11 +28,12 @@ from sb3_lac.checks import (
     spaces_of,
     warn_of_free_terminations,
 )
-from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, same_distributions, update_multiplier
+from sb3_lac.compiled import CompiledUpdate, compiled_update
 from sb3_lac.discounts import stated_discount
 from sb3_lac.files import replacing
 from sb3_lac.policies import LyapunovCritic, LyapunovPolicy
 from sb3_lac.reward_bound import RewardBound
+from sb3_lac.updates import Metrics, backward, same_distributions
 
 SelfCostAlgorithm = TypeVar("SelfCostAlgorithm", bound="CostAlgorithm")
 
@@ -140,7 +142,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self._project_lambda()
 
         if self.compile_update:
-            self._compiled = CompiledUpdate(type(self)._update, self.device)
+            self._compiled = compiled_update(type(self)._update, self.device)
 
         self.bound_in(self._vec_normalize_env).raise_to(0.0)
 
@@ -276,6 +278,16 @@ class CostAlgorithm(OffPolicyAlgorithm):
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
         return th.exp(self.log_lambda.detach()), ent_coef
 
+    def _parameters_of(self, network: BaseModel) -> list[th.Tensor]:
+        """What a network learns by: what its optimizer holds, and what none does, as an encoder that somebody else steps."""
+        critic, actor = (
+            [parameter for group in each.optimizer.param_groups for parameter in group["params"]]
+            for each in (self.critic, self.actor)
+        )
+        held = {id(parameter) for parameter in (*critic, *actor)}
+        others = [parameter for parameter in network.parameters() if id(parameter) not in held]
+        return [*(critic if network is self.critic else actor), *others]
+
     def _update_multipliers(self, violation: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
         """Optimize the multipliers of the decrease condition and of the entropy, and tell their losses."""
         metrics = {"lambda_loss": update_multiplier(self.log_lambda, self.lambda_optimizer, violation)}
@@ -350,8 +362,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfCostAlgorithm:
-        if self.compile_update:
-            check_compiler(self.device)
+        if self._compiled is not None:
+            self._compiled.check()
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
@@ -406,6 +418,18 @@ class CostAlgorithm(OffPolicyAlgorithm):
         if self.ent_coef_optimizer is None:
             return state_dicts, ["log_lambda", "ent_coef_tensor"]
         return [*state_dicts, "ent_coef_optimizer"], ["log_lambda", "log_ent_coef"]
+
+
+def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, violation: th.Tensor) -> th.Tensor:
+    """
+    Step of a Lagrange multiplier in log space, which grows while its constraint is violated
+    (see https://github.com/rail-berkeley/softlearning/issues/37 for the logarithm).
+    """
+    loss = -log_multiplier * violation.detach()
+    optimizer.zero_grad()
+    backward(loss, [log_multiplier])
+    optimizer.step()
+    return loss.detach()
 
 
 def whole(path: Any, suffix: str) -> AbstractContextManager[Any]:

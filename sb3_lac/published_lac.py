@@ -7,15 +7,15 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
 from sb3_lac.buffers import HorizonReplayBuffer, Samples
 from sb3_lac.checks import check_rate
-from sb3_lac.compiled import Metrics, polyak_update, set_gradients, step
 from sb3_lac.cost_algorithm import CostAlgorithm
 from sb3_lac.policies import PublishedCnnPolicy, PublishedMultiInputPolicy, PublishedPolicy, largest_value
+from sb3_lac.updates import Metrics, backward
 
 
 class PublishedLAC(CostAlgorithm):
@@ -223,9 +223,12 @@ class PublishedLAC(CostAlgorithm):
         actor_loss = lambda_coef * violation + ent_coef * log_prob.mean()
 
         # Optimize the critic and the actor, both with the gradient at the current parameters
-        set_gradients((self.critic, critic_loss), (self.actor, actor_loss))
-        step(self.critic.optimizer)
-        step(self.actor.optimizer)
+        self.critic.optimizer.zero_grad()
+        self.actor.optimizer.zero_grad()
+        backward(critic_loss, self._parameters_of(self.critic))
+        backward(actor_loss, self._parameters_of(self.actor))
+        self.critic.optimizer.step()
+        self.actor.optimizer.step()
 
         metrics = {
             "actor_loss": actor_loss,
