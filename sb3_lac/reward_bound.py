@@ -20,16 +20,13 @@ def reward_scale(vec_normalize: VecNormalize | None) -> float:
 class RewardBound:
     """
     The largest reward stated or seen, at least 0, and the offset of the critics that belongs to it. Both are part of the
-    policy; this is a view of them.
-
-    :param policy: The policy whose critics have the offset
-    :param stated: What is stated, 0 where nothing is. It may be larger than the bound in the file of a model.
-    :param n_costs: What ``L`` is where each step costs 1, infinite without a discount
-    :param vec_normalize: What normalizes the rewards that the agent sees
+    policy; this is a view of them, in the units of the rewards that the agent sees.
     """
 
     policy: LyapunovPolicy
+    #: 0 where nothing is stated. It may be larger than the bound in the file of a model
     stated: float
+    #: What ``L`` is where each step costs 1
     n_costs: float
     vec_normalize: VecNormalize | None
 
@@ -59,13 +56,7 @@ class RewardBound:
         self.policy.critic_target.offset.copy_(offset)
 
     def costs(self, rewards: th.Tensor, n_rewards: float | th.Tensor) -> th.Tensor:
-        """
-        Get the costs of sampled rewards, of which none is negative. The bound follows larger ones.
-
-        :param rewards: Rewards that the agent sees, or returns
-        :param n_rewards: How often a reward of each step counts in a return
-        :return: As many costs
-        """
+        """Get the costs of returns of so many rewards, none of them negative. The bound follows larger rewards."""
         largest_reward = (rewards / n_rewards).max()
         self.raise_to(largest_reward * reward_scale(self.vec_normalize))
         # Changes of the units round

@@ -31,13 +31,8 @@ class TracedOptimizer:
 
 
 @contextmanager
-def traced_optimizers(known: dict[th.optim.Optimizer, TracedOptimizer], *owners: Any) -> Iterator[None]:
-    """
-    Have the optimizers of a model and of its networks in the form that can be traced.
-
-    :param known: The form of each that was there before: PyTorch goes by identity
-    :param owners: The model and its networks
-    """
+def traced_optimizers(known: dict[th.optim.Optimizer, TracedOptimizer], owners: list[Any]) -> Iterator[None]:
+    """Have the optimizers of a model and of its networks in a form that can be traced, the known one if there is one."""
     named = [(owner, name, value) for owner in owners for name, value in vars(owner).items()]
     held = [place for place in named if isinstance(place[2], th.optim.Optimizer)]
     try:

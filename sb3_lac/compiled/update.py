@@ -161,7 +161,7 @@ class CompiledUpdate:
         try:
             for network in networks:
                 network.observation_space = self._space
-            traced = traced_optimizers(self._traced, model, *networks)
+            traced = traced_optimizers(self._traced, [model, *networks])
             with traced, th.no_grad(), dynamo.config.patch(trace_autograd_ops=True):
                 yield update
         finally:
@@ -174,12 +174,7 @@ class CompiledUpdate:
 
 
 def compiled_update(update: Callable[..., Metrics], device: th.device) -> CompiledUpdate | None:
-    """
-    Have an update compiled, or none where nobody has tried it with this torch.
-
-    :param update: The update, a function of the model, of samples, and of what else changes from one to the next
-    :param device: Device of the model
-    """
+    """Have an update compiled, or nothing where nobody has tried that with this torch."""
     if th.__version__ < _OLDEST_TORCH:
         raise RuntimeError(
             f"compile_update=True needs torch>={_OLDEST_TORCH}, the first that has gradients within a compiled graph, and "
