@@ -58,7 +58,7 @@ from benchmarks.training import (
     set_up,
 )
 from sb3_lac import DashboardCallback, LyapunovCallback
-from sb3_lac.costs import CostAlgorithm
+from sb3_lac.cost_algorithm import CostAlgorithm
 
 
 def part(recipe: dict[str, Any], out: Path) -> Tables:

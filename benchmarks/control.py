@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from benchmarks.study import EVALUATION_SEED
 from sb3_lac import certify, evaluate_lyapunov, fit_lyapunov
-from sb3_lac.costs import CostAlgorithm
+from sb3_lac.cost_algorithm import CostAlgorithm
 from sb3_lac.envs import CostEnv, reference_controller
 from sb3_lac.stability import CriticLyapunov
 

@@ -105,7 +105,7 @@ def test_sb3_lac_knows_nothing_of_batteries_but_that_they_may_be_registered():
 OF_STABILITY = {
     "plots": set(),
     "statistics": set(),
-    "functions": {"costs"},
+    "functions": {"cost_algorithm"},
     "rollout": {"stability.functions"},
     "loop": {"stability.functions", "stability.rollout", "vec_env"},
     "fitting": {"stability.functions", "stability.loop", "stability.rollout"},

@@ -3,6 +3,7 @@
 import ast
 import re
 
+import gymnasium as gym
 import pytest
 
 from battery_env import ClosedForm, TrajectoryDataset, evaluate, plotting
@@ -34,6 +35,17 @@ def test_the_pages_say_what_the_code_says():
         assert environment_pages.render(name, text) == text, "run python -m docs.environment_pages"
     for env_id in environment_pages.CONTROL_IDS:
         assert PAGES[env_id] == environment_pages.environment_page(env_id)
+
+
+def test_the_tables_of_physical_parameters_are_those_of_the_classes():
+    for env_id in environment_pages.CONTROL_IDS:
+        env = gym.make(env_id).unwrapped
+        table = type(env).__doc__.split("## Arguments")[1].split("##")[0]
+        written = {
+            name: float(default) for name, default in re.findall(r"^ +\| `(\w+)` \| ([\d.]+) \|", table, flags=re.MULTILINE)
+        }
+        noise = {name: getattr(env, name) for name in written.keys() & {"noise_std"}}
+        assert written == {**env.nominal_parameters, **noise}, env_id
 
 
 def test_every_environment_has_a_page():

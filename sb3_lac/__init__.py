@@ -6,8 +6,8 @@ import sb3_lac.envs  # noqa: F401  (registers the ids of the cost environments)
 from sb3_lac.callbacks import CertificateCallback, LyapunovCallback
 from sb3_lac.dashboard import DashboardCallback
 from sb3_lac.lac import LAC
-from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy, PublishedPolicy
-from sb3_lac.published_lac import PublishedLAC
+from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy
+from sb3_lac.published_lac import PublishedLAC, PublishedPolicy
 from sb3_lac.stability import FittedLyapunov, LyapunovFunction, LyapunovReport, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.vec_env import GymnasiumVecEnv
 

@@ -5,12 +5,13 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
 from sb3_lac.buffers import Samples
-from sb3_lac.compiled import Metrics, polyak_update, set_gradients, step
-from sb3_lac.costs import CostAlgorithm
+from sb3_lac.cost_algorithm import CostAlgorithm
 from sb3_lac.policies import CnnPolicy, LyapunovPolicy, MlpPolicy, MultiInputPolicy, RootCritic, largest_value
+from sb3_lac.updates import Metrics, backward
 
 
 class LAC(CostAlgorithm):
@@ -86,7 +87,8 @@ class LAC(CostAlgorithm):
         reward is seen, or if ``None``, it is the largest one seen. ``gamma`` must be below 1 with a bound above 0.
     :param compile_update: Whether to compile each update to one graph (``torch.compile``), on a GPU a CUDA graph. It
         needs torch 2.11, and takes minutes at the first update and when a constant like ``batch_size`` has changed.
-        Where there are hooks, or an optimizer with a ``step()`` of its own, updates are as without it, and a warning says so.
+        Where there are hooks, an optimizer with a ``step()`` of its own, or a torch that was not tried (above 2.13), updates
+        are as without it, and a warning says so.
     :param check_observations: Whether to refuse an observation that is not finite, or beyond 1.8e19. ``False`` is for a
         features extractor that handles such numbers: NaN as a reading that is missing, inf as nothing in range.
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
@@ -250,9 +252,12 @@ class LAC(CostAlgorithm):
         actor_loss = lambda_coef * objective + ent_coef * log_prob.mean()
 
         # Optimize the critic and the actor, both with the gradient at the current parameters
-        set_gradients((self.critic, critic_loss), (self.actor, actor_loss))
-        step(self.critic.optimizer)
-        step(self.actor.optimizer)
+        self.critic.optimizer.zero_grad()
+        self.actor.optimizer.zero_grad()
+        backward(critic_loss, self._parameters_of(self.critic))
+        backward(actor_loss, self._parameters_of(self.actor))
+        self.critic.optimizer.step()
+        self.actor.optimizer.step()
 
         metrics = {
             "actor_loss": actor_loss,

@@ -30,7 +30,7 @@ _HANDING_ON = (
     *(
         "gymnasium.core.Wrapper.",
         "gymnasium.core.RewardWrapper.",
-        "sb3_lac.envs.drawing.",
+        "sb3_lac.envs.randomisation.",
         "stable_baselines3.common.monitor.",
     ),
     *("gymnasium.vector.vector_env.VectorWrapper.", "gymnasium.vector.vector_env.VectorRewardWrapper."),

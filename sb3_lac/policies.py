@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import (
     create_mlp,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.sac.policies import Actor, SACPolicy
+from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
@@ -133,25 +133,6 @@ class LyapunovCritic(BaseModel):
         :return: Values of shape (n, 1)
         """
         return largest_value(self(obs, actions))
-
-
-class SumOfSquaresCritic(LyapunovCritic):
-    """
-    Lyapunov critic of ``PublishedLAC``: ``L`` is the sum of the squares of the activations of the last layer, with which
-    ``net_arch`` ends. The arguments are those of ``LyapunovCritic``.
-    """
-
-    n_outputs = -1
-
-    def __init__(
-        self, observation_space: spaces.Space, action_space: spaces.Box, net_arch: list[int], *args: Any, **kwargs: Any
-    ):
-        if not net_arch:
-            raise ValueError("net_arch must have a layer for the critic: L is the sum of its squares.")
-        super().__init__(observation_space, action_space, net_arch, *args, **kwargs)
-
-    def lyapunov_of(self, output: th.Tensor) -> th.Tensor:
-        return output.square().sum(dim=1, keepdim=True)
 
 
 class RootCritic(LyapunovCritic):
@@ -340,45 +321,10 @@ class MultiInputPolicy(LyapunovPolicy):
         super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
 
 
-class PublishedPolicy(LyapunovPolicy):
-    """
-    Policy class (with both actor and critic) for ``PublishedLAC``: that of LAC, with a ``SumOfSquaresCritic``, a target actor,
-    and the networks of Han et al. (2020).
+def __getattr__(name: str) -> Any:
+    """Find what files of earlier models name here."""
+    if name not in ("PublishedCnnPolicy", "PublishedMultiInputPolicy", "PublishedPolicy", "SumOfSquaresCritic"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from sb3_lac import published_lac  # which imports this module
 
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param lr_schedule: Learning rate schedule (could be constant)
-    :param net_arch: Hidden layers of the actor (``pi``), and those of the critic (``qf``), whose last one is squared
-    :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
-    :param kwargs: The other arguments of ``LyapunovPolicy``
-    """
-
-    critic_class = SumOfSquaresCritic
-    actor_target: Actor
-
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        net_arch: list[int] | dict[str, list[int]] | None = None,
-        n_critics: int = 1,
-        **kwargs: Any,
-    ):
-        net_arch = {"pi": [64, 64], "qf": [64, 64, 16]} if net_arch is None else net_arch
-        super().__init__(observation_space, action_space, lr_schedule, net_arch, n_critics=n_critics, **kwargs)
-
-    def _build(self, lr_schedule: Schedule) -> None:
-        super()._build(lr_schedule)
-        self.actor_target = self.make_actor()
-        self.actor_target.load_state_dict(self.actor.state_dict())
-        # Target networks should always be in eval mode
-        self.actor_target.set_training_mode(False)
-
-
-class PublishedCnnPolicy(CnnPolicy, PublishedPolicy):
-    """``PublishedPolicy`` for image observations, with the arguments of ``CnnPolicy``."""
-
-
-class PublishedMultiInputPolicy(MultiInputPolicy, PublishedPolicy):
-    """``PublishedPolicy`` for dictionary observations, with the arguments of ``MultiInputPolicy``."""
+    return getattr(published_lac, name)

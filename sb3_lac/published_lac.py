@@ -1,3 +1,5 @@
+"""The algorithm of Han et al. (2020): its critic, its policies, its replay buffer, and its update."""
+
 from typing import Any, ClassVar
 
 import numpy as np
@@ -7,14 +9,129 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import Actor
 from torch.nn import functional as F
 
-from sb3_lac.buffers import HorizonReplayBuffer, Samples
-from sb3_lac.compiled import Metrics, polyak_update, set_gradients, step
-from sb3_lac.costs import CostAlgorithm, check_rate
-from sb3_lac.policies import PublishedCnnPolicy, PublishedMultiInputPolicy, PublishedPolicy, largest_value
+from sb3_lac.buffers import SAMPLED_AT_ONCE, Samples
+from sb3_lac.checks import check_rate
+from sb3_lac.cost_algorithm import CostAlgorithm
+from sb3_lac.policies import CnnPolicy, LyapunovCritic, LyapunovPolicy, MultiInputPolicy, largest_value
+from sb3_lac.updates import Metrics, backward
+
+
+class SumOfSquaresCritic(LyapunovCritic):
+    """
+    Lyapunov critic of ``PublishedLAC``: ``L`` is the sum of the squares of the activations of the last layer, with which
+    ``net_arch`` ends. The arguments are those of ``LyapunovCritic``.
+    """
+
+    n_outputs = -1
+
+    def __init__(
+        self, observation_space: spaces.Space, action_space: spaces.Box, net_arch: list[int], *args: Any, **kwargs: Any
+    ):
+        if not net_arch:
+            raise ValueError("net_arch must have a layer for the critic: L is the sum of its squares.")
+        super().__init__(observation_space, action_space, net_arch, *args, **kwargs)
+
+    def lyapunov_of(self, output: th.Tensor) -> th.Tensor:
+        return output.square().sum(dim=1, keepdim=True)
+
+
+class PublishedPolicy(LyapunovPolicy):
+    """
+    Policy class (with both actor and critic) for ``PublishedLAC``: that of LAC, with a ``SumOfSquaresCritic``, a target actor,
+    and the networks of Han et al. (2020).
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: Hidden layers of the actor (``pi``), and those of the critic (``qf``), whose last one is squared
+    :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
+    :param kwargs: The other arguments of ``LyapunovPolicy``
+    """
+
+    critic_class = SumOfSquaresCritic
+    actor_target: Actor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        n_critics: int = 1,
+        **kwargs: Any,
+    ):
+        net_arch = {"pi": [64, 64], "qf": [64, 64, 16]} if net_arch is None else net_arch
+        super().__init__(observation_space, action_space, lr_schedule, net_arch, n_critics=n_critics, **kwargs)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.actor_target = self.make_actor()
+        self.actor_target.load_state_dict(self.actor.state_dict())
+        # Target networks should always be in eval mode
+        self.actor_target.set_training_mode(False)
+
+
+class PublishedCnnPolicy(CnnPolicy, PublishedPolicy):
+    """``PublishedPolicy`` for image observations, with the arguments of ``CnnPolicy``."""
+
+
+class PublishedMultiInputPolicy(MultiInputPolicy, PublishedPolicy):
+    """``PublishedPolicy`` for dictionary observations, with the arguments of ``MultiInputPolicy``."""
+
+
+class HorizonReplayBuffer(ReplayBuffer):
+    """
+    Replay buffer that tells the sum of the rewards of ``horizon`` steps, from that of the transition on. Behind the end of an
+    episode, a time limit or a termination, its last reward goes on, as in the code of Han et al. (2020). The latest
+    transitions, whose horizon is not over yet, are not sampled. While fewer steps than a horizon are stored it is the oldest
+    transition that is, and the latest reward that goes on.
+
+    :param args: Arguments of ``ReplayBuffer``
+    :param horizon: Number of steps whose rewards are summed
+    :param kwargs: Arguments of ``ReplayBuffer``. ``optimize_memory_usage`` is not supported.
+    """
+
+    def __init__(self, *args: Any, horizon: int = 5, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.horizon = horizon
+        if self.optimize_memory_usage:
+            raise NotImplementedError("HorizonReplayBuffer doesn't support optimize_memory_usage=True")
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Samples:  # type: ignore[override]
+        n_known = max(self.size() - self.horizon + 1, min(self.size(), 1))
+        oldest = self.pos if self.full else 0
+        return self._get_samples((oldest + np.random.randint(0, n_known, size=batch_size)) % self.buffer_size, env)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Samples:  # type: ignore[override]
+        # Sample randomly the env idx
+        env_indices = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        n_stored = min(self.horizon, self.size())
+        steps = (batch_inds[:, None] + np.arange(n_stored)) % self.buffer_size
+        # The step itself or, behind the end of its episode, the last one
+        ends = self.dones[steps, env_indices[:, None]] > 0
+        last = np.where(ends.any(axis=1), ends.argmax(axis=1), n_stored - 1)
+        steps = (batch_inds[:, None] + np.minimum(np.arange(self.horizon), last[:, None])) % self.buffer_size
+        rewards = self._normalize_reward(self.rewards[steps, env_indices[:, None]], env)
+        dones = self.dones[batch_inds, env_indices] * (1 - self.timeouts[batch_inds, env_indices])
+        return Samples(
+            observations=self.to_torch(self._normalize_obs(self.observations[batch_inds, env_indices], env)),  # type: ignore[arg-type]
+            actions=self.to_torch(self.actions[batch_inds, env_indices]),
+            next_observations=self.to_torch(
+                self._normalize_obs(self.next_observations[batch_inds, env_indices], env)  # type: ignore[arg-type]
+            ),
+            dones=self.to_torch(dones[:, None]),
+            rewards=self.to_torch(rewards[:, :1]),
+            discounts=None,
+            horizon_rewards=self.to_torch(rewards.sum(axis=1, keepdims=True)),
+        )
+
+
+SAMPLED_AT_ONCE.add(HorizonReplayBuffer)
 
 
 class PublishedLAC(CostAlgorithm):
@@ -222,9 +339,12 @@ class PublishedLAC(CostAlgorithm):
         actor_loss = lambda_coef * violation + ent_coef * log_prob.mean()
 
         # Optimize the critic and the actor, both with the gradient at the current parameters
-        set_gradients((self.critic, critic_loss), (self.actor, actor_loss))
-        step(self.critic.optimizer)
-        step(self.actor.optimizer)
+        self.critic.optimizer.zero_grad()
+        self.actor.optimizer.zero_grad()
+        backward(critic_loss, self._parameters_of(self.critic))
+        backward(actor_loss, self._parameters_of(self.actor))
+        self.critic.optimizer.step()
+        self.actor.optimizer.step()
 
         metrics = {
             "actor_loss": actor_loss,

@@ -4,11 +4,11 @@ import gymnasium as gym
 
 from sb3_lac.envs.base import CostEnv
 from sb3_lac.envs.cart_pole import CartPoleCostEnv
-from sb3_lac.envs.drawing import DomainRandomization
 from sb3_lac.envs.linear import LinearCostEnv
 from sb3_lac.envs.oscillator import OscillatorEnv
 from sb3_lac.envs.pendulum import PendulumCostEnv
 from sb3_lac.envs.quadrotor import QuadrotorCostEnv
+from sb3_lac.envs.randomisation import DomainRandomization
 from sb3_lac.envs.references import ReferenceController, reference_controller
 from sb3_lac.envs.vehicle import VehicleCostEnv
 

@@ -1,3 +1,4 @@
+import inspect
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -7,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.drawing import Draw, Ranges
+from sb3_lac.envs.randomisation import Randomisation, Ranges
 
 if TYPE_CHECKING:  # slow to import, and only pictures need it
     from matplotlib.axes import Axes
@@ -34,6 +35,17 @@ def check_whole(**values: float) -> None:
             raise ValueError(f"{name}={value} must be a whole number of steps.")
 
 
+def stated_parameters(problem: type["CostEnv"], options: dict[str, Any]) -> dict[str, float]:
+    """
+    Take the physical parameters out of the options of a problem, whose class states each of them once, with its default.
+
+    :param problem: The class, whose annotated attributes they are
+    :param options: Arguments by name; those that are parameters leave it
+    :return: All parameters by name
+    """
+    return {name: options.pop(name, getattr(problem, name)) for name in inspect.get_annotations(problem)}
+
+
 def _noise_std(name: str, std: float | Sequence[float], n: int) -> np.ndarray | None:
     """The standard deviation of each of n variables, None if there is no noise."""
     values = np.array(std, dtype=np.float64)
@@ -51,7 +63,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     Actions lie in [-1, 1]; each problem scales them. ``reset(options={"state": ...})`` starts from a given state.
 
     The disturbances are arguments of every problem, and off by default. A reference controller does not know of them. They are
-    the same in all episodes, or drawn anew for each: a policy that is trained so learns a plant that changes.
+    the same in all episodes, or random in each: a policy that is trained so learns a plant that changes.
 
     :param parameters: Physical parameters of the problem by name. They become attributes of the environment
     :param state_low: Smallest value of each state variable, shape (n,)
@@ -65,9 +77,9 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         step, in its unit; one number for all, or one for each
     :param observation_noise: Disturbance: the same for each observed variable
     :param action_delay: Disturbance: steps until an action takes effect. Before that the plant gets zeros
-    :param drawn: Disturbances that each episode draws anew, uniformly, in place of what is fixed: by name the smallest and
+    :param drawn: Disturbances that each episode samples anew, uniformly, in place of what is fixed: by name the smallest and
         the largest value of any of ``parameters``, ``impulse``, ``process_noise``, ``observation_noise`` and
-        ``action_delay``. ``info["drawn"]`` tells what was drawn
+        ``action_delay``. ``info["drawn"]`` tells what was sampled
     :param last_actions: How many of the last actions are added to the end of an observation, the latest first, zeros before
         the start: what a policy needs to know of actions that are still to take effect
     :param render_mode: ``"rgb_array"`` for pictures of the plant and of the episode so far, or None
@@ -125,9 +137,9 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         self.nominal_parameters = dict(parameters)
         disturbances = {"impulse": impulse, "process_noise": process_noise, "observation_noise": observation_noise}
         fixed = {**parameters, **disturbances, "action_delay": action_delay}
-        self._draw_disturbances = Draw(drawn or {}, {**dict.fromkeys(fixed, 0.0), "action_delay": 0})
-        self._drawn: dict[str, float] = {}
-        for values in (self._draw_disturbances.smallest, self._draw_disturbances.largest, {**fixed, **changed}):
+        self._randomisation = Randomisation(drawn or {}, {**dict.fromkeys(fixed, 0.0), "action_delay": 0})
+        self._sampled: dict[str, float] = {}
+        for values in (self._randomisation.smallest, self._randomisation.largest, {**fixed, **changed}):
             self._disturb(values)
         self.render_mode = render_mode
         self.state: np.ndarray | None = None
@@ -155,7 +167,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
 
     @abstractmethod
     def _initial_state(self) -> np.ndarray:
-        """Draw the state that an episode starts from."""
+        """Sample the state that an episode starts from."""
 
     @abstractmethod
     def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
@@ -194,7 +206,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     def _info(self, **told: float) -> dict[str, Any]:
         """What is told beside an observation."""
         info: dict[str, Any] = {**told, "error": self._error()}
-        return {**info, "drawn": dict(self._drawn)} if self._drawn else info
+        return {**info, "drawn": dict(self._sampled)} if self._sampled else info
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode, with ``options={"state": ...}`` from a given state; ``info`` holds its ``"error"``."""
@@ -210,8 +222,8 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
                     f"from {self.state_low.tolist()} to {self.state_high.tolist()}."
                 )
         # After the start, which is the same without disturbances
-        self._drawn = self._draw_disturbances(self.np_random)
-        self._disturb(self._drawn)
+        self._sampled = self._randomisation.sample(self.np_random)
+        self._disturb(self._sampled)
         self.state = start
         self.n_steps = 0
         self._history = [(start, np.nan)]

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv
+from sb3_lac.envs.base import CostEnv, stated_parameters
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,10 +71,10 @@ class CartPoleCostEnv(CostEnv):
     state_names = ("x (m)", "dx/dt (m/s)", "theta (rad)", "dtheta/dt (rad/s)")
     error_name = "distance of the pole's tip from where it should be (m)"
     error_tolerance = 0.1
-    cart_mass_kg: float
-    pole_mass_kg: float
-    pole_half_length_m: float
-    force_max_N: float
+    cart_mass_kg: float = 1.0
+    pole_mass_kg: float = 0.1
+    pole_half_length_m: float = 0.5
+    force_max_N: float = 20.0
 
     GRAVITY_M_S2 = 10.0
     DT_S = 0.02
@@ -82,20 +82,8 @@ class CartPoleCostEnv(CostEnv):
     THETA_MAX_RAD = 0.349
     TERMINAL_COST = 100.0
 
-    def __init__(
-        self,
-        cart_mass_kg: float = 1.0,
-        pole_mass_kg: float = 0.1,
-        pole_half_length_m: float = 0.5,
-        force_max_N: float = 20.0,
-        **options: Any,
-    ) -> None:
-        parameters = {
-            "cart_mass_kg": cart_mass_kg,
-            "pole_mass_kg": pole_mass_kg,
-            "pole_half_length_m": pole_half_length_m,
-            "force_max_N": force_max_N,
-        }
+    def __init__(self, **options: Any) -> None:
+        parameters = stated_parameters(CartPoleCostEnv, options)
         state_high = np.array([2 * self.X_MAX_M, 1000.0, 1.0, 1000.0])
         observation_space = spaces.Box(-state_high.astype(np.float32), state_high.astype(np.float32))
         super().__init__(parameters, -state_high, state_high, observation_space, n_actions=1, **options)

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative
+from sb3_lac.envs.base import CostEnv, check_not_negative, stated_parameters
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,7 +76,7 @@ class LinearCostEnv(CostEnv):
     state_names = ("position", "velocity")
     error_name = "norm of the state"
     error_tolerance = 0.1
-    control_max: float
+    control_max: float = 2.0
 
     A = np.array([[0.96, 0.2], [-0.2, 0.96]])
     B = np.array([[0.0], [0.5]])
@@ -84,11 +84,12 @@ class LinearCostEnv(CostEnv):
     R = np.eye(1)
     STATE_MAX = 100.0
 
-    def __init__(self, noise_std: float = 0.01, control_max: float = 2.0, **options: Any) -> None:
+    def __init__(self, noise_std: float = 0.01, **options: Any) -> None:
         check_not_negative(noise_std=noise_std)
         observation_space = spaces.Box(-self.STATE_MAX, self.STATE_MAX, (2,), np.float32)
         state_high = np.full(2, self.STATE_MAX)
-        super().__init__({"control_max": control_max}, -state_high, state_high, observation_space, n_actions=1, **options)
+        parameters = stated_parameters(LinearCostEnv, options)
+        super().__init__(parameters, -state_high, state_high, observation_space, n_actions=1, **options)
         self.noise_std = noise_std
 
     def _initial_state(self) -> np.ndarray:

@@ -3,7 +3,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv
+from sb3_lac.envs.base import CostEnv, stated_parameters
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,34 +78,18 @@ class OscillatorEnv(CostEnv):
     state_names = ("m1", "m2", "m3", "p1", "p2", "p3")
     error_name = "distance of the first protein from its reference"
     error_tolerance = 0.1
-    transcription: float
-    half_saturation: float
-    messenger_decay: float
-    light: float
-    translation: float
-    protein_decay: float
+    transcription: float = 1.6
+    half_saturation: float = 1.0
+    messenger_decay: float = 0.16
+    light: float = 5.0
+    translation: float = 0.16
+    protein_decay: float = 0.06
 
     PERIOD_STEPS = 200
     STATE_MAX = 1000.0
 
-    def __init__(
-        self,
-        transcription: float = 1.6,
-        half_saturation: float = 1.0,
-        messenger_decay: float = 0.16,
-        light: float = 5.0,
-        translation: float = 0.16,
-        protein_decay: float = 0.06,
-        **options: Any,
-    ) -> None:
-        parameters = {
-            "transcription": transcription,
-            "half_saturation": half_saturation,
-            "messenger_decay": messenger_decay,
-            "light": light,
-            "translation": translation,
-            "protein_decay": protein_decay,
-        }
+    def __init__(self, **options: Any) -> None:
+        parameters = stated_parameters(OscillatorEnv, options)
         observation_space = spaces.Box(0.0, self.STATE_MAX, (8,), np.float32)
         super().__init__(parameters, np.zeros(6), np.full(6, self.STATE_MAX), observation_space, n_actions=3, **options)
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative
+from sb3_lac.envs.base import CostEnv, check_not_negative, stated_parameters
 from sb3_lac.envs.integration import runge_kutta_step
 
 if TYPE_CHECKING:
@@ -80,24 +80,17 @@ class PendulumCostEnv(CostEnv):
     state_names = ("theta (rad)", "dtheta/dt (rad/s)")
     error_name = "angle from upright (rad)"
     error_tolerance = 0.01
-    mass_kg: float
-    length_m: float
-    damping_Nms: float
-    torque_max_Nm: float
+    mass_kg: float = 1.0
+    length_m: float = 1.0
+    damping_Nms: float = 0.0
+    torque_max_Nm: float = 3.0
 
     GRAVITY_M_S2 = 9.81
     DT_S = 0.05
     SPEED_MAX_RAD_S = 12.0
 
-    def __init__(
-        self,
-        mass_kg: float = 1.0,
-        length_m: float = 1.0,
-        damping_Nms: float = 0.0,
-        torque_max_Nm: float = 3.0,
-        **options: Any,
-    ) -> None:
-        parameters = dict(mass_kg=mass_kg, length_m=length_m, damping_Nms=damping_Nms, torque_max_Nm=torque_max_Nm)
+    def __init__(self, **options: Any) -> None:
+        parameters = stated_parameters(PendulumCostEnv, options)
         state_high = np.array([math.pi, self.SPEED_MAX_RAD_S])
         observation_high = np.array([1.0, 1.0, self.SPEED_MAX_RAD_S], dtype=np.float32)
         observation_space = spaces.Box(-observation_high, observation_high)

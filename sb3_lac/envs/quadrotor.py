@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv
+from sb3_lac.envs.base import CostEnv, stated_parameters
 from sb3_lac.envs.integration import runge_kutta_step
 
 if TYPE_CHECKING:
@@ -86,10 +86,10 @@ class QuadrotorCostEnv(CostEnv):
     state_names = ("x (m)", "z (m)", "phi (rad)", "dx/dt (m/s)", "dz/dt (m/s)", "dphi/dt (rad/s)")
     error_name = "distance to the point (m)"
     error_tolerance = 0.01
-    mass_kg: float
-    inertia_kg_m2: float
-    arm_m: float
-    rotor_force_max_N: float
+    mass_kg: float = 1.0
+    inertia_kg_m2: float = 0.02
+    arm_m: float = 0.2
+    rotor_force_max_N: float = 9.81
 
     GRAVITY_M_S2 = 9.81
     DT_S = 0.02
@@ -99,15 +99,8 @@ class QuadrotorCostEnv(CostEnv):
     WEIGHTS = (0.16, 0.07, 0.05)
     TERMINAL_COST = 300.0
 
-    def __init__(
-        self,
-        mass_kg: float = 1.0,
-        inertia_kg_m2: float = 0.02,
-        arm_m: float = 0.2,
-        rotor_force_max_N: float = 9.81,
-        **options: Any,
-    ) -> None:
-        parameters = dict(mass_kg=mass_kg, inertia_kg_m2=inertia_kg_m2, arm_m=arm_m, rotor_force_max_N=rotor_force_max_N)
+    def __init__(self, **options: Any) -> None:
+        parameters = stated_parameters(QuadrotorCostEnv, options)
         position = 2 * self.POSITION_MAX_M
         state_high = np.array([position, position, math.pi, 20.0, 20.0, 50.0])
         # The float32 nearest to pi is above it

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv
+from sb3_lac.envs.base import CostEnv, stated_parameters
 from sb3_lac.envs.integration import runge_kutta_step
 
 if TYPE_CHECKING:
@@ -104,14 +104,14 @@ class VehicleCostEnv(CostEnv):
     _n_drawn = 5  # the place on the path would dwarf the others, and the plant shows it
     error_name = "offset from the path (m)"
     error_tolerance = 0.01
-    mass_kg: float
-    inertia_kg_m2: float
-    front_axle_m: float
-    rear_axle_m: float
-    friction: float
-    speed_m_s: float
-    steering_lag_s: float
-    steering_max_rad: float
+    mass_kg: float = 1500.0
+    inertia_kg_m2: float = 2500.0
+    front_axle_m: float = 1.3
+    rear_axle_m: float = 1.4
+    friction: float = 0.9
+    speed_m_s: float = 15.0
+    steering_lag_s: float = 0.1
+    steering_max_rad: float = 0.2
 
     GRAVITY_M_S2 = 9.81
     DT_S = 0.05
@@ -126,28 +126,8 @@ class VehicleCostEnv(CostEnv):
     WEIGHTS = (0.2, 0.1, 0.1)
     TERMINAL_COST = 300.0
 
-    def __init__(
-        self,
-        mass_kg: float = 1500.0,
-        inertia_kg_m2: float = 2500.0,
-        front_axle_m: float = 1.3,
-        rear_axle_m: float = 1.4,
-        friction: float = 0.9,
-        speed_m_s: float = 15.0,
-        steering_lag_s: float = 0.1,
-        steering_max_rad: float = 0.2,
-        **options: Any,
-    ) -> None:
-        parameters = {
-            "mass_kg": mass_kg,
-            "inertia_kg_m2": inertia_kg_m2,
-            "front_axle_m": front_axle_m,
-            "rear_axle_m": rear_axle_m,
-            "friction": friction,
-            "speed_m_s": speed_m_s,
-            "steering_lag_s": steering_lag_s,
-            "steering_max_rad": steering_max_rad,
-        }
+    def __init__(self, **options: Any) -> None:
+        parameters = stated_parameters(VehicleCostEnv, options)
         moving = [2 * self.OFFSET_MAX_M, 2 * self.ANGLE_MAX_RAD, 20.0, 5.0, 1.0]
         observation_high = np.array([*moving, 5.0, 5.0], dtype=np.float32)
         super().__init__(

@@ -12,7 +12,7 @@ import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_lac.costs import advice_for_a_time_limit
+from sb3_lac.checks import advice_for_a_time_limit
 from sb3_lac.stability.functions import LyapunovFunction
 from sb3_lac.stability.loop import ClosedLoop, closed_loop
 from sb3_lac.stability.rollout import flatten, summarize_episodes

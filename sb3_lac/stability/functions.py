@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_lac.costs import CostAlgorithm
+from sb3_lac.cost_algorithm import CostAlgorithm
 
 Observations = np.ndarray | dict[str, np.ndarray]
 _NUMBER = (float, int, np.number)

@@ -11,7 +11,8 @@ import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_lac.costs import CostAlgorithm, advice_for_a_time_limit
+from sb3_lac.checks import advice_for_a_time_limit
+from sb3_lac.cost_algorithm import CostAlgorithm
 from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
 from sb3_lac.stability.loop import closed_loop
 from sb3_lac.stability.rollout import summarize_episodes

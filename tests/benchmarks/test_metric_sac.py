@@ -5,7 +5,7 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.metric_sac import MetricSAC
-from sb3_lac import compiled
+from sb3_lac.compiled import update as compiled
 from tests.sweeps import sweep
 
 ENV_ID = "LinearCost-v0"

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 
 from benchmarks import speed
-from sb3_lac import compiled
+from sb3_lac.compiled import update as compiled
 
 
 @pytest.fixture(autouse=True)

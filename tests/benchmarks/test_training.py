@@ -15,7 +15,8 @@ from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 from benchmarks import training
 from benchmarks.study import digest_of
-from sb3_lac import LAC, compiled
+from sb3_lac import LAC
+from sb3_lac.compiled import update as compiled
 
 ENV_ID = "LinearCost-v0"
 PUBLISHED = Path(__file__).parents[2] / "docs" / "results"

@@ -12,7 +12,7 @@ from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from sb3_lac import LAC
-from sb3_lac.costs import CostAlgorithm
+from sb3_lac.cost_algorithm import CostAlgorithm
 
 
 class LinearCostEnv(gym.Env):

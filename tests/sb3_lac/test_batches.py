@@ -103,7 +103,7 @@ class Weighted(ReplayBuffer):
 @pytest.mark.parametrize("compile_update", sweep(False, True))
 @pytest.mark.parametrize("algorithm", [LAC, PublishedLAC])
 def test_samples_may_be_any_object_with_other_parts(make_model, n_updates, monkeypatch, algorithm, compile_update):
-    monkeypatch.setattr("sb3_lac.compiled.BACKEND", "eager")
+    monkeypatch.setattr("sb3_lac.compiled.update.BACKEND", "eager")
     model = make_model(algorithm=algorithm, replay_buffer_class=Weighted, compile_update=compile_update)
     model.train(3, model.batch_size)
     assert n_updates(model) == 3

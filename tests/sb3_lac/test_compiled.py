@@ -15,7 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 from torch.torch_version import TorchVersion
 
-from sb3_lac import LAC, PublishedLAC, compiled, costs
+from sb3_lac import LAC, PublishedLAC
+from sb3_lac.compiled import update as compiled
 from tests.sweeps import sweep
 
 
@@ -116,7 +117,7 @@ def test_compiled_and_eager_updates_are_the_same(make_model, make_env, monkeypat
     from torch._inductor import config
 
     monkeypatch.setattr(compiled, "BACKEND", backend)
-    monkeypatch.setattr(costs, "check_compiler", lambda device: None)  # other code to wait for
+    monkeypatch.setattr(compiled.CompiledUpdate, "check", lambda self: None)  # other code to wait for
     kwargs = kwargs.copy()
     kwargs["env"] = kwargs.pop("wrapper", lambda env: env)(make_env())
     eager, eager_logged = trained(make_model(**kwargs))
@@ -238,6 +239,15 @@ def test_old_torch_is_refused(make_model, monkeypatch):
     monkeypatch.setattr(th, "__version__", TorchVersion("2.10.1+cpu"))
     with pytest.raises(RuntimeError, match=r"needs torch>=2.11, .* this is torch 2.10.1\+cpu"):
         make_model(compile_update=True)
+
+
+def test_a_torch_that_was_not_tried_trains_without_compilation_and_says_so_once(make_model, monkeypatch):
+    monkeypatch.setattr(th, "__version__", TorchVersion("2.100.0a0+git"))
+    with pytest.warns(UserWarning, match=r"this is torch 2\.100\.0a0\+git, .* tried up to torch 2\.13") as caught:
+        model = make_model(compile_update=True)
+        trained(model)
+    assert sum("not compiled" in str(each.message) for each in caught) == 1
+    assert_close(model, trained(make_model())[0])
 
 
 def test_missing_compiler_is_noticed_before_the_first_step(make_model, monkeypatch):

@@ -332,7 +332,7 @@ class TestDisturbances:
         np.testing.assert_array_equal(plain.state, disturbed.state)
         check_env(disturbed)
 
-    def test_each_episode_draws_within_its_ranges_and_is_that_of_what_was_drawn(self, make, actions):
+    def test_each_episode_samples_within_its_ranges_and_is_that_of_what_was_sampled(self, make, actions):
         name, value = next(iter(make().nominal_parameters.items()))
         ranges = {name: (0.9 * value, 1.1 * value), "action_delay": (0, 2), "impulse": (0.1, 0.2)}
         env, seen = self.quiet(make, drawn=ranges), []
@@ -425,7 +425,7 @@ class TestDomainRandomization:
             ({"action_space": (1.0, 2.0)}, "which are none of"),
             ({"spec.mass": (1.0, 2.0)}, r"\['spec.mass'\], which are none of"),
             ({"action_space.low[1]": (1.0, 2.0)}, "which are none of"),
-            ({"last": (1.0, 2.0)}, r"last has 3 numbers\. Draw one of them, as last\[0\], or give .* a property"),
+            ({"last": (1.0, 2.0)}, r"last has 3 numbers\. Randomise one of them, as last\[0\], or give .* a property"),
             ({"m": (2.0, 1.0)}, r"drawn\['m'\]=\(2.0, 1.0\) must be the smallest and the largest value"),
             ({"m": (1.0, np.inf)}, "two finite numbers"),
             ({"m": 1.0}, "two finite numbers"),

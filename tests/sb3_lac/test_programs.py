@@ -16,7 +16,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
-from sb3_lac import LAC, GymnasiumVecEnv, PublishedLAC, certify, compiled, evaluate_lyapunov, fit_lyapunov
+from sb3_lac import LAC, GymnasiumVecEnv, PublishedLAC, certify, evaluate_lyapunov, fit_lyapunov
+from sb3_lac.compiled import update as compiled
 from sb3_lac.onnx import export_onnx
 from sb3_lac.stability import LyapunovFunction
 from tests.sweeps import sweep

@@ -15,7 +15,7 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_lac import LAC, LyapunovPolicy, PublishedLAC, PublishedPolicy
-from sb3_lac.buffers import HorizonReplayBuffer
+from sb3_lac.published_lac import HorizonReplayBuffer
 from tests.sb3_lac.equations import mlp, policy_sample
 
 GAMMA, TAU, ALPHA3 = 0.9, 0.05, 0.3

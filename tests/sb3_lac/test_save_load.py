@@ -9,7 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_lac import LAC, PublishedLAC
+from sb3_lac import LAC, PublishedLAC, published_lac
 from tests.sweeps import sweep
 
 
@@ -106,3 +106,17 @@ def test_arguments_are_kept_checked_and_can_be_changed(make_model, tmp_path):
     for wrong in ("lots", None, [1.0]):
         with pytest.raises(ValueError, match=r"^alpha3=.* must be a number"):
             LAC.load(tmp_path / "model", alpha3=wrong)
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [
+        ("policies", "PublishedPolicy"),
+        ("policies", "PublishedCnnPolicy"),
+        ("policies", "PublishedMultiInputPolicy"),
+        ("policies", "SumOfSquaresCritic"),
+        ("buffers", "HorizonReplayBuffer"),
+    ],
+)
+def test_files_of_earlier_versions_find_classes_where_these_were(module, name):
+    assert pickle.loads(f"csb3_lac.{module}\n{name}\n.".encode()) is getattr(published_lac, name)

@@ -242,7 +242,7 @@ def test_update_reads_no_value_back_from_the_device(make_model, monkeypatch):
     for method in ("item", "tolist", "__float__", "__bool__", "numpy", "cpu"):
         monkeypatch.setattr(th.Tensor, method, count(method))
     # Samples are looked at where that waits for nothing
-    monkeypatch.setattr("sb3_lac.costs.refuse_samples", lambda *args: None)
+    monkeypatch.setattr("sb3_lac.cost_algorithm.refuse_samples", lambda *args: None)
     # Arguments of distributions are checked on the host, by PyTorch and not by the update
     monkeypatch.setattr(th.distributions.Distribution, "_validate_args", False)
     model.train(gradient_steps=5, batch_size=16)

@@ -1,4 +1,4 @@
-"""What algorithms for costs share: costs in place of rewards, Lagrange multipliers, the loop of updates, files."""
+"""What algorithms for costs share: Lagrange multipliers, the loop of updates, files."""
 
 import math
 import os
@@ -13,16 +13,27 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import Actor
 
 from sb3_lac.buffers import Samples, batches_at_once, split
-from sb3_lac.compiled import CompiledUpdate, Metrics, check_compiler, same_distributions, update_multiplier
+from sb3_lac.checks import (
+    check_arguments,
+    form_of,
+    refuse_samples,
+    refuse_what_spoils_weights,
+    spaces_of,
+    warn_of_free_terminations,
+)
+from sb3_lac.compiled import CompiledUpdate, compiled_update
 from sb3_lac.discounts import stated_discount
 from sb3_lac.files import replacing
 from sb3_lac.policies import LyapunovCritic, LyapunovPolicy
+from sb3_lac.reward_bound import RewardBound
+from sb3_lac.updates import Metrics, backward, same_distributions
 
 SelfCostAlgorithm = TypeVar("SelfCostAlgorithm", bound="CostAlgorithm")
 
@@ -131,9 +142,9 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self._project_lambda()
 
         if self.compile_update:
-            self._compiled = CompiledUpdate(type(self)._update, self.device)
+            self._compiled = compiled_update(type(self)._update, self.device)
 
-        self.raise_bound(0.0)
+        self.bound_in(self._vec_normalize_env).raise_to(0.0)
 
     def _create_aliases(self) -> None:
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
@@ -148,39 +159,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self.lambda_lr_schedule = None if self.lambda_learning_rate is None else FloatSchedule(self.lambda_learning_rate)
 
     def _check_arguments(self) -> None:
-        """Check the arguments that SAC does not have."""
-        needed = self.policy_aliases["MlpPolicy"]
-        critics = [getattr(policy, "critic_class", object) for policy in (self.policy_class, needed)]
-        if not (issubclass(self.policy_class, needed) and issubclass(*critics)):
-            named = self.policy_class.__name__
-            raise ValueError(f"{type(self).__name__} needs a policy derived from {needed.__name__}, and this is {named}.")
-        with np.errstate(over="ignore"):
-            ranges = self.action_space.high - self.action_space.low  # type: ignore[attr-defined]
-        if not (ranges > 0).all():
-            raise ValueError(f"The bounds of {self.action_space} must differ: leave out the actions that cannot be chosen.")
-        if not np.isfinite(ranges).all():
-            raise ValueError(
-                f"The bounds of {self.action_space} are so far apart that their difference, which actions are scaled by, is "
-                "infinite. State those of the actions that are of use, for instance with gymnasium.wrappers.TransformAction("
-                "env, lambda action: action, gymnasium.spaces.Box(-10, 10, env.action_space.shape))."
-            )
-        if not 0 <= self.gamma <= 1:
-            raise ValueError(f"gamma={self.gamma} must lie within 0 .. 1.")
-        if not 0 < self.alpha3 < math.inf:
-            raise ValueError(f"alpha3={self.alpha3} must be greater than 0, and finite.")
-        lambda_max = self.lambda_init if self.lambda_max is None else self.lambda_max
-        if not 0 < self.lambda_min <= lambda_max < math.inf or not 0 < self.lambda_init < math.inf:
-            limits = f"lambda_min={self.lambda_min}, lambda_init={self.lambda_init} and lambda_max={self.lambda_max}"
-            raise ValueError(f"{limits} must be greater than 0 and finite, and the least of them lambda_min.")
-        if self.lambda_learning_rate is not None:
-            check_rate("lambda_learning_rate", self.lambda_learning_rate)
-        if not 0 <= (self.reward_bound or 0.0) < math.inf:
-            raise ValueError(f"reward_bound={self.reward_bound} must be finite and at least 0, what a termination pays.")
-        if self.reward_bound and self.n_costs == math.inf:
-            raise ValueError(
-                f"gamma={self.gamma} must be smaller than 1 with rewards up to {self.reward_bound}: each step below that has "
-                "a cost, and the sum over all time is infinite. Use for instance gamma=0.99."
-            )
+        """Refuse arguments that make no sense, before anything is made."""
+        check_arguments(self)
 
     def _adopt_replay_buffer(self) -> None:
         """Let the replay buffer sample as the model says, or refuse it."""
@@ -211,6 +191,10 @@ class CostAlgorithm(OffPolicyAlgorithm):
         """What ``L`` is where each step costs 1, infinite without a discount."""
         return 1 / (1 - self.gamma) if self.gamma < 1 else math.inf
 
+    def bound_in(self, vec_normalize: VecNormalize | None) -> RewardBound:
+        """The bound, in the units that the agent sees through a normalization."""
+        return RewardBound(self.policy, self.reward_bound or 0.0, self.n_costs, vec_normalize)
+
     @property
     def largest_reward(self) -> th.Tensor:
         """The largest reward stated or seen, before any normalization, shape (1,). It is part of the policy, as ``L`` is."""
@@ -218,24 +202,11 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
     def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
         """The reward that costs nothing, in the units of the rewards that the agent sees, shape (1,)."""
-        # One that is stated when a model is loaded may be larger than the one in its file
-        bound = self.largest_reward.clamp(min=self.reward_bound or 0.0)
-        if vec_normalize is None or not vec_normalize.norm_reward:
-            return bound
-        return (bound / reward_scale(vec_normalize)).clamp(max=vec_normalize.clip_reward)
-
-    def raise_bound(self, reward: float | th.Tensor) -> None:
-        """Let the bound be at least a reward of the environment, and the one that is stated, and tell the critics."""
-        self.largest_reward.copy_(self.cost_bound().clamp(min=reward))
-        # The scale of the rewards may have changed too
-        self.update_offset(self._vec_normalize_env)
+        return self.bound_in(vec_normalize).value
 
     def update_offset(self, vec_normalize: VecNormalize | None) -> None:
         """Give the critics the value of ``L`` where nothing is ever paid."""
-        bound = self.cost_bound(vec_normalize)
-        offset = th.where(bound > 0, bound * self.n_costs, 0.0)
-        self.policy.critic.offset.copy_(offset)
-        self.policy.critic_target.offset.copy_(offset)
+        self.bound_in(vec_normalize).update_offset()
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         self._adopt_replay_buffer()
@@ -283,7 +254,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
                     "shown as infinite. Use for instance gamma=0.99.",
                     stacklevel=2,
                 )
-            self.raise_bound(float(paid.max()))
+            self.bound_in(vec_normalize).raise_to(float(paid.max()))
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def costs(self, replay_data: Samples) -> th.Tensor:
@@ -293,12 +264,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         """
         # How often a reward of each step counts in a return: 1 + gamma + ... + gamma^(n-1)
         n_rewards = 1.0 if replay_data.discounts is None else (1 - replay_data.discounts) / (1 - self.gamma)
-        largest_reward = (replay_data.rewards / n_rewards).max()
-        vec_normalize = self._vec_normalize_env
-        self.raise_bound(largest_reward * reward_scale(vec_normalize))
-        # Changes of the units round
-        bound = th.maximum(self.cost_bound(vec_normalize), largest_reward)
-        return bound * n_rewards - replay_data.rewards
+        return self.bound_in(self._vec_normalize_env).costs(replay_data.rewards, n_rewards)
 
     def _update(self, replay_data: Samples, costs: th.Tensor, update_targets: bool) -> Metrics:
         """One update of all that is learned. It may be compiled: nothing in it may wait for a value on the host."""
@@ -311,6 +277,16 @@ class CostAlgorithm(OffPolicyAlgorithm):
         # see https://github.com/rail-berkeley/softlearning/issues/60
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
         return th.exp(self.log_lambda.detach()), ent_coef
+
+    def _parameters_of(self, network: BaseModel) -> list[th.Tensor]:
+        """What a network learns by: what its optimizer holds, and what none does, as an encoder that somebody else steps."""
+        critic, actor = (
+            [parameter for group in each.optimizer.param_groups for parameter in group["params"]]
+            for each in (self.critic, self.actor)
+        )
+        held = {id(parameter) for parameter in (*critic, *actor)}
+        others = [parameter for parameter in network.parameters() if id(parameter) not in held]
+        return [*(critic if network is self.critic else actor), *others]
 
     def _update_multipliers(self, violation: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
         """Optimize the multipliers of the decrease condition and of the entropy, and tell their losses."""
@@ -386,8 +362,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfCostAlgorithm:
-        if self.compile_update:
-            check_compiler(self.device)
+        if self._compiled is not None:
+            self._compiled.check()
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
@@ -430,7 +406,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         # Its limits may be others than those of the file
         model._project_lambda()
         if model.env is not None and {"gamma", "reward_bound"} & {*kwargs, *(kwargs.get("custom_objects") or ())}:
-            model.raise_bound(0.0)
+            model.bound_in(model._vec_normalize_env).raise_to(0.0)
         return model
 
     def _excluded_save_params(self) -> list[str]:
@@ -444,106 +420,16 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return [*state_dicts, "ent_coef_optimizer"], ["log_lambda", "log_ent_coef"]
 
 
-def warn_of_free_terminations(replay_buffer: ReplayBuffer | None, n_costs: float) -> None:
-    """Warn if, in what is stored, the last step before a termination costs no more than another step does."""
-    # A time limit is no termination, and some buffers cannot tell
-    if not isinstance(replay_buffer, ReplayBuffer) or not replay_buffer.handle_timeout_termination:
-        return
-    # From the oldest step on
-    stored = (np.arange(replay_buffer.size()) + (replay_buffer.pos if replay_buffer.full else 0)) % replay_buffer.buffer_size
-    costs, done = 0.0 - replay_buffer.rewards[stored], replay_buffer.dones[stored] > 0
-    ends = done & (replay_buffer.timeouts[stored] == 0)
-    if not ends.any() or ends.all():
-        return
-    others, last = costs[~ends], costs[ends].mean()
-    price = others.mean() * n_costs
-    # An end that costs less than any other step is a goal
-    if others.min() <= last <= others.max() and price > 0:
-        # Of a buffer that is full the first episodes have lost their first steps
-        lengths = [np.diff(np.flatnonzero(column), prepend=-1)[int(replay_buffer.full) :] for column in done.T]
-        advice = advice_for_a_time_limit(np.concatenate(lengths)) or (
-            "Where the end is the goal, all is well. Where it is a failure, to fail early is the cheapest policy of any "
-            "algorithm: give the last step a cost of its own, above that of going on, here about "
-            f"{price:.3g} (what L is where each step has the mean cost)."
-        )
-        warnings.warn(
-            f"The last step before a termination costs {last:.3g} on average, no more than another step does (up to "
-            f"{others.max():.3g}). {advice}",
-            stacklevel=3,
-        )
-
-
-def advice_for_a_time_limit(lengths: np.ndarray) -> str:
-    """Say what terminations of episodes of so many steps look like, if they are all alike, and otherwise nothing."""
-    if len(set(lengths)) != 1:
-        return ""
-    advice = (
-        f"All episodes that ended ({len(lengths)}) have {lengths[0]} steps, as with a time limit. If it is one, return "
-        "truncated=True at its end and not terminated=True, as gymnasium.wrappers.TimeLimit(env, max_episode_steps=...) does: "
-        "nothing has to be paid where the plant would go on."
-    )
-    return advice if len(lengths) > 1 else f"{advice} If it is a failure, its last step has to cost more than going on."
-
-
-def check_rate(name: str, rate: float | Schedule) -> None:
-    """Refuse a learning rate of one's own: optimizers only check the one that they are made with, ``learning_rate``."""
-    if not 0 <= FloatSchedule(rate)(1) < math.inf:
-        raise ValueError(f"{name}={rate} must start at a finite rate of at least 0.")
-
-
-def refuse_what_spoils_weights(name: str, value: Any, step: int, vec_normalize: VecNormalize | None = None) -> None:
-    """Raise a ``ValueError`` that names the number, if it is not finite, or has a square that float32 cannot hold."""
-    if isinstance(value, dict):
-        for key, part in value.items():
-            refuse_what_spoils_weights(f"{name} {key!r}", part, step, vec_normalize)
-        return
-    numbers = np.asarray(value)
-    with np.errstate(over="ignore"):
-        sound = (
-            np.isfinite(np.square(numbers, dtype=np.float32, casting="same_kind")) if numbers.dtype.kind == "f" else np.True_
-        )
-    if sound.all():
-        return
-    remedy, normalized = "Clip or replace it in a wrapper of the environment.", "norm_reward"
-    if "observation" in name:
-        remedy += " A features extractor that handles such numbers needs check_observations=False."
-        normalized = "norm_obs"
-    if vec_normalize is not None and vec_normalize.training and getattr(vec_normalize, normalized):
-        remedy += " The statistics of VecNormalize have it already: begin with new ones, or with those of an earlier file."
-    raise ValueError(
-        f"The {name} {numbers[~sound].ravel()[0]} at step {step}: all must be finite, and within +-1.8e19, whose square "
-        f"float32 holds. {remedy}"
-    )
-
-
-def refuse_samples(replay_data: Samples, step: int, check_observations: bool) -> None:
-    """The same for samples: rewards may be computed only then (HER), and a buffer may have been filled elsewhere."""
-    names = ("actions", "rewards", "observations", "next_observations") if check_observations else ("actions", "rewards")
-    named = [(name, getattr(replay_data, name)) for name in names]
-    parts = [(name, part) for name, each in named for part in (each.values() if isinstance(each, dict) else [each])]
-    # One question for all: a sum of squares is finite only where all of them are
-    if not math.isfinite(sum(part.float().square().sum() for _, part in parts if part.is_floating_point())):
-        for name, part in parts:
-            refuse_what_spoils_weights(f"replay buffer gave {name} with", part.numpy(force=True), step)
-
-
-def spaces_of(replay_buffer: Any) -> list[spaces.Space]:
-    """The spaces of what a replay buffer stores, if it says them."""
-    return [getattr(replay_buffer, name) for name in ("observation_space", "action_space") if hasattr(replay_buffer, name)]
-
-
-def form_of(space: spaces.Space) -> Any:
-    """What arrays of a space have in common: whatever their limits, those of a box have one shape and one kind of numbers."""
-    if isinstance(space, spaces.Dict):
-        return {name: form_of(part) for name, part in space.spaces.items()}
-    return (space.shape, space.dtype.kind) if isinstance(space, spaces.Box) else space
-
-
-def reward_scale(vec_normalize: VecNormalize | None) -> float:
-    """What a reward of the environment is divided by before the agent sees it."""
-    if vec_normalize is None or not vec_normalize.norm_reward:
-        return 1.0
-    return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)
+def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, violation: th.Tensor) -> th.Tensor:
+    """
+    Step of a Lagrange multiplier in log space, which grows while its constraint is violated
+    (see https://github.com/rail-berkeley/softlearning/issues/37 for the logarithm).
+    """
+    loss = -log_multiplier * violation.detach()
+    optimizer.zero_grad()
+    backward(loss, [log_multiplier])
+    optimizer.step()
+    return loss.detach()
 
 
 def whole(path: Any, suffix: str) -> AbstractContextManager[Any]:

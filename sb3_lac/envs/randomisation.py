@@ -13,13 +13,13 @@ from gymnasium.utils import RecordConstructorArgs
 Ranges = Mapping[str, Sequence[float]]
 
 
-class Draw:
+class Randomisation:
     """
-    Numbers that each episode draws anew, uniformly and independently.
+    Numbers that each episode has anew, uniformly and independently distributed.
 
     :param ranges: Smallest and largest value of each, by name
-    :param present: The present values of what can be drawn. Where one is a whole number, and both ends are, whole numbers are
-        drawn, the ends among them
+    :param present: The present values of what can be randomised. Where one is a whole number, and both ends are, whole
+        numbers are sampled, the ends among them
     """
 
     def __init__(self, ranges: Ranges, present: Mapping[str, float]) -> None:
@@ -36,8 +36,8 @@ class Draw:
             for name, ends in ranges.items()
         }
 
-    def __call__(self, generator: np.random.Generator) -> dict[str, float]:
-        """Draw all of them."""
+    def sample(self, generator: np.random.Generator) -> dict[str, float]:
+        """Sample all of them."""
         return {
             name: (
                 int(generator.integers(int(low), int(self.largest[name]), endpoint=True))
@@ -50,7 +50,7 @@ class Draw:
 
 class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """
-    Domain randomisation of any environment: each episode draws attributes of ``env.unwrapped`` anew, so that a policy is
+    Domain randomisation of any environment: each episode samples attributes of ``env.unwrapped`` anew, so that a policy is
     trained for a plant that changes. The cost environments do this by their own argument ``drawn``.
 
     .. code-block:: python
@@ -61,10 +61,10 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     They must be numbers that the environment reads while it runs: what it has copied, as into a simulator, stays as it is.
     Those that lie deeper are named by their path, as ``"model.opt.gravity[2]"`` and ``"model.body_mass[1]"`` of MuJoCo. For a
-    factor of a whole array give the environment a property that sets the array, and draw that.
+    factor of a whole array give the environment a property that sets the array, and randomise that.
 
     :param env: The environment
-    :param drawn: Smallest and largest value of each attribute, in its unit; drawn uniformly, and in whole numbers where the
+    :param drawn: Smallest and largest value of each attribute, in its unit; sampled uniformly, and in whole numbers where the
         attribute and both ends are
     :raises ValueError: If an attribute is no number of the environment, or a range makes no sense
     """
@@ -81,34 +81,34 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                 value = owner[part] if _has_items(owner) else getattr(owner, part)
                 if np.size(value) > 1:
                     raise ValueError(
-                        f"{name} has {np.size(value)} numbers. Draw one of them, as {name}[0], or give the environment a "
-                        "property that sets all of them, and draw that."
+                        f"{name} has {np.size(value)} numbers. Randomise one of them, as {name}[0], or give the environment "
+                        "a property that sets all of them, and randomise that."
                     )
                 if _is_number(value):
                     numbers[name] = value
-        self._draw = Draw(drawn, numbers)
+        self._randomisation = Randomisation(drawn, numbers)
         self._generator = np.random.default_rng()
-        self._drawn: dict[str, float] = {}
+        self._sampled: dict[str, float] = {}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Draw, and start an episode; ``info["drawn"]`` says what was drawn, here and after each step."""
+        """Randomise, and start an episode; ``info["drawn"]`` says what was sampled, here and after each step."""
         if seed is not None:
             # Not the numbers of the environment once more, which has this seed, too
             self._generator = np.random.default_rng((seed, 1))
-        self._drawn = self._draw(self._generator)
-        for name, value in self._drawn.items():
+        self._sampled = self._randomisation.sample(self._generator)
+        for name, value in self._sampled.items():
             owner, part = _place(self.env.unwrapped, name)
             if _has_items(owner):
                 owner[part] = value
             else:
                 setattr(owner, part, value)
         observation, info = self.env.reset(seed=seed, options=options)
-        return observation, {**info, "drawn": dict(self._drawn)}
+        return observation, {**info, "drawn": dict(self._sampled)}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Move on by one step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, {**info, "drawn": dict(self._drawn)}
+        return observation, reward, terminated, truncated, {**info, "drawn": dict(self._sampled)}
 
 
 def _is_number(value: Any) -> bool:
