@@ -175,12 +175,12 @@ def controllers(env_id: str) -> dict[str, PolicyPredictor]:
 def judge(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
     """Fit, evaluate and certify one policy; for LAC, the critic beside the fitted function."""
     env = make_vec_env(env_id, n_envs=CERTIFICATE_ENVS)
-    fitted = fit_lyapunov(policy, env, episodes, seed=_FIT_SEED, progress_bar=False)
-    certification = certify(policy, env, fitted, episodes, seed=_CERTIFICATION_SEED)
+    fitted = fit_lyapunov(policy, env, n_episodes=episodes, seed=_FIT_SEED, progress_bar=False)
+    certification = certify(policy, env, lyapunov=fitted, n_episodes=episodes, seed=_CERTIFICATION_SEED)
     functions = {"fitted": fitted} | ({"critic": CriticLyapunov(policy)} if isinstance(policy, CostAlgorithm) else {})
     rows = []
     for function, lyapunov in functions.items():
-        report = evaluate_lyapunov(policy, env, episodes, seed=_JUDGE_SEED, lyapunov=lyapunov)
+        report = evaluate_lyapunov(policy, env, n_episodes=episodes, seed=_JUDGE_SEED, lyapunov=lyapunov)
         row: dict[str, Any] = {"function": function, "holds": report.holds}
         settled_below = SETTLED_SHARE * report.metrics["start_cost"].value
         row["settles"] = report.holds and report.metrics["cost_bound"].high < settled_below
