@@ -30,7 +30,7 @@ UPDATES, CELLS_AT_ONCE, LEARNING_STARTS = 800, 64, 1000  # published results hav
 def compared(out: Path) -> str:
     """Train the algorithms, and say what they reached."""
     timesteps = UPDATES * CELLS_AT_ONCE + LEARNING_STARTS
-    compare.main(["--envs", ENV, "--timesteps", str(timesteps), "--evaluations", "4", "--out", str(out)])
+    compare.main(["--envs", ENV, "--timesteps", str(timesteps), "--evaluations", "4", "--jobs", "3", "--out", str(out)])
     trained = pd.read_csv(out / "compare.csv").dropna(subset="seed")  # the closed form has none
     errors = [f"{row.algo.upper()} {row.mape_percent:.2g} % ({row.mape_worst_percent:.2g} %)" for row in trained.itertuples()]
     return f"R_o of held-out simulated cells, mean error (worst discharge): {', '.join(errors)}"
@@ -38,7 +38,7 @@ def compared(out: Path) -> str:
 
 @contextmanager
 def followed(out: Path) -> Iterator[None]:
-    """Calibrate to all discharges of a real cell meanwhile, which a core does that no training takes."""
+    """Calibrate to all discharges of a real cell meanwhile: with three trainings beside it no core is ever idle."""
     command = [sys.executable, "-m", "battery_env", CELL, "--table-only", "--force", "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         try:
