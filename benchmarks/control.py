@@ -20,6 +20,7 @@ from sb3_lac import certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.costs import CostAlgorithm
 from sb3_lac.envs import CostEnv, reference_controller
 from sb3_lac.stability import CriticLyapunov
+from sb3_lac.stability.rollout import SETTLED_SHARE
 
 #: By environment: its impulse, parameters that are not as they should be, noise on states, noise on observations, delay.
 DISTURBANCES: dict[str, tuple[float, dict[str, float], float, float, int]] = {
@@ -43,8 +44,6 @@ SHARES = {
 FACTORS = {"reference": 1.0, "weak": 0.5, "too weak": 0.15, "wrong sign": -1.0}
 #: The linear problem is stable by itself: with 15 % of the gain it settles, and with the wrong sign of -14 % hardly leaves.
 LINEAR_FACTORS = {"reference": 1.0, "weak": 0.15, "hardly unstable": -0.14, "wrong sign": -1.0}
-#: Share of the cost at the start below which a loop counts as settled.
-SETTLED_SHARE = 0.1
 #: What is certified, see ``sb3_lac.certify``.
 STATEMENTS = ("survives", "stays_within", "decreases")
 #: Environments of a certificate, which an equal number of episodes each start in.

@@ -135,11 +135,7 @@ def test_exact_lyapunov_function_is_recognized(make_exact_model, monkeypatch, ga
     verdict = "holds on average" if alpha3 <= feasible else "is violated on average"
     assert f"With alpha3={alpha3:g} the decrease condition {verdict}" in report.summary(full=True)
     first, *others = report.summary().splitlines()
-    assert (
-        report.holds
-        and first.startswith("HOLDS, and rests at 0 % of the start's cost. The mean cost")
-        and "not proved" in others[0]
-    )
+    assert report.holds and first.startswith("HOLDS, and rests at ") and "not proved" in others[0]
     assert len(others) == 1 and report.summary(full=True).startswith(report.summary())
 
 
