@@ -211,9 +211,9 @@ class LyapunovReport:
         if decided:
             return f"NOT SHOWN: {decided[0].reason.value} {decided[0].measured}."
         if found:
-            enough = max(each.enough for each in found if each.enough is not None)
+            most = max(each.enough for each in found if each.enough is not None)
             why = f"{found[0].reason.value} {found[0].measured}"
-            return f"NOT SHOWN, and {SHORT}: {why}. {n_episodes} do not tell, n_episodes={enough} may."
+            return f"NOT SHOWN, and {SHORT}: {why}. {n_episodes} do not tell, n_episodes={most} may."
         start, enough = metrics["start_cost"].value, self._enough(metrics["late_rise"]) if self._late_rise_matters() else None
         rises = "" if enough is None else f" But {SHORT}: whether {Reason.COST_RISES.value}, n_episodes={enough} may tell."
         return (
