@@ -20,6 +20,7 @@ from sb3_lac import certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.cost_algorithm import CostAlgorithm
 from sb3_lac.envs import CostEnv, reference_controller
 from sb3_lac.stability import CriticLyapunov
+from sb3_lac.stability.rollout import SETTLED_SHARE
 
 #: By environment: its impulse, parameters that are not as they should be, noise on states, noise on observations, delay.
 DISTURBANCES: dict[str, tuple[float, dict[str, float], float, float, int]] = {
@@ -43,8 +44,6 @@ SHARES = {
 FACTORS = {"reference": 1.0, "weak": 0.5, "too weak": 0.15, "wrong sign": -1.0}
 #: The linear problem is stable by itself: with 15 % of the gain it settles, and with the wrong sign of -14 % hardly leaves.
 LINEAR_FACTORS = {"reference": 1.0, "weak": 0.15, "hardly unstable": -0.14, "wrong sign": -1.0}
-#: Share of the cost at the start below which a loop counts as settled.
-SETTLED_SHARE = 0.1
 #: What is certified, see ``sb3_lac.certify``.
 STATEMENTS = ("survives", "stays_within", "decreases")
 #: Environments of a certificate, which an equal number of episodes each start in.
@@ -175,12 +174,12 @@ def controllers(env_id: str) -> dict[str, PolicyPredictor]:
 def judge(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
     """Fit, evaluate and certify one policy; for LAC, the critic beside the fitted function."""
     env = make_vec_env(env_id, n_envs=CERTIFICATE_ENVS)
-    fitted = fit_lyapunov(policy, env, episodes, seed=_FIT_SEED, progress_bar=False)
-    certification = certify(policy, env, fitted, episodes, seed=_CERTIFICATION_SEED)
+    fitted = fit_lyapunov(policy, env, n_episodes=episodes, seed=_FIT_SEED, progress_bar=False)
+    certification = certify(policy, env, lyapunov=fitted, n_episodes=episodes, seed=_CERTIFICATION_SEED)
     functions = {"fitted": fitted} | ({"critic": CriticLyapunov(policy)} if isinstance(policy, CostAlgorithm) else {})
     rows = []
     for function, lyapunov in functions.items():
-        report = evaluate_lyapunov(policy, env, episodes, seed=_JUDGE_SEED, lyapunov=lyapunov)
+        report = evaluate_lyapunov(policy, env, n_episodes=episodes, seed=_JUDGE_SEED, lyapunov=lyapunov)
         row: dict[str, Any] = {"function": function, "holds": report.holds}
         settled_below = SETTLED_SHARE * report.metrics["start_cost"].value
         row["settles"] = report.holds and report.metrics["cost_bound"].high < settled_below

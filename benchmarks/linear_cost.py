@@ -95,7 +95,7 @@ def part(seed: int, timesteps: int, episodes: int, models: Path) -> Tables:
     model = train_or_load(Recipe.of("lac", _ENV_ID, seed, timesteps), models / f"seed{seed}")
     assert isinstance(model, LAC)
     env = LinearCostEnv()
-    measured = evaluate_lyapunov(model, gym.make(_ENV_ID), n_eval_episodes=episodes, deterministic=True, seed=EVALUATION_SEED)
+    measured = evaluate_lyapunov(model, gym.make(_ENV_ID), n_episodes=episodes, deterministic=True, seed=EVALUATION_SEED)
     states = measured.observations
     assert states is not None
     actions, _ = model.predict(states.astype(np.float32), deterministic=True)

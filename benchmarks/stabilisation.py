@@ -44,7 +44,6 @@ from benchmarks.control import (
     DISTURBANCES,
     FACTORS,
     LINEAR_FACTORS,
-    SETTLED_SHARE,
     SHARES,
     conditions,
     controllers,
@@ -75,6 +74,7 @@ from benchmarks.study import (
 from benchmarks.training import Recipe, record_file, train_or_load, training_minutes
 from sb3_lac.envs import CostEnv
 from sb3_lac.stability.plots import format_log_axis
+from sb3_lac.stability.rollout import SETTLED_SHARE
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ folder.mkdir(parents=True, exist_ok=True)
 names = ["x (m)", "dx/dt (m/s)", "theta (rad)", "dtheta/dt (rad/s)"]
 
 # Episodes of 600 steps: with a discount of 0.99, costs beyond them count for little
-report = evaluate_lyapunov(model, gym.make("CartPoleCost-v0", max_episode_steps=600), n_eval_episodes=50, seed=1)
+report = evaluate_lyapunov(model, gym.make("CartPoleCost-v0", max_episode_steps=600), n_episodes=50, seed=1)
 print(report.summary())
 report.plot().savefig(folder / "certificate.png")
 

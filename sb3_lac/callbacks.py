@@ -20,7 +20,7 @@ from sb3_lac.stability import (
     fit_lyapunov,
 )
 from sb3_lac.stability.certification import check_bound
-from sb3_lac.stability.loop import closed_loop, vectorized
+from sb3_lac.stability.loop import by_keyword, closed_loop, vectorized
 from sb3_lac.stability.report import critic_of
 from sb3_lac.stability.rollout import mean_reward
 
@@ -44,7 +44,7 @@ class LyapunovCallback(EventCallback):
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the report in
         ``self.parent.last_report``. ``StopTrainingOnRewardThreshold`` and ``StopTrainingOnNoModelImprovement`` ask for
         ``self.parent.best_mean_reward``, the largest mean return of an evaluation (of the rewards in the report).
-    :param n_eval_episodes: The number of episodes to test the agent
+    :param n_episodes: Number of episodes of an evaluation
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param seed: Seed of each evaluation, so that all of them have the same start states; if it is None, each draws its own
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
@@ -59,18 +59,19 @@ class LyapunovCallback(EventCallback):
         *("ultimate_bound", "death_rate"),
     )
 
+    @by_keyword
     def __init__(
         self,
         eval_env: gym.Env | VecEnv,
         callback_after_eval: BaseCallback | None = None,
-        n_eval_episodes: int = 20,
+        n_episodes: int = 20,
         eval_freq: int = 10_000,
         seed: int | None = None,
         verbose: int = 1,
     ):
         super().__init__(callback_after_eval, verbose=verbose)
         self.eval_env = vectorized(eval_env)
-        self.n_eval_episodes = n_eval_episodes
+        self.n_episodes = n_episodes
         self.eval_freq = eval_freq
         self.seed = seed
         self.history: list[dict[str, float]] = []
@@ -80,7 +81,7 @@ class LyapunovCallback(EventCallback):
 
     def _init_callback(self) -> None:
         # A mistake is seen before the training, and not at its first evaluation
-        with closed_loop(self.model, self.eval_env, self._judged(), self.n_eval_episodes, seed=self.seed) as loop:
+        with closed_loop(self.model, self.eval_env, self._judged(), self.n_episodes, seed=self.seed) as loop:
             self.eval_env = loop.env
         # Not of another training, nor of steps that are taken again from a checkpoint on
         self.history = [entry for entry in self.history if entry["timesteps"] <= self.model.num_timesteps]
@@ -124,7 +125,7 @@ class LyapunovCallback(EventCallback):
 
     def _evaluate(self) -> float:
         """Make the reports of an evaluation, and return the mean reward of an episode."""
-        self.last_report = evaluate_lyapunov(self.model, self.eval_env, self.n_eval_episodes, seed=self.seed)
+        self.last_report = evaluate_lyapunov(self.model, self.eval_env, n_episodes=self.n_episodes, seed=self.seed)
         return mean_reward(self.last_report.transitions)
 
     def _values(self) -> dict[str, float]:
@@ -155,7 +156,7 @@ class CertificateCallback(LyapunovCallback):
     :param eval_env: The environment used for evaluation, as for ``LyapunovCallback``
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the reports in
         ``self.parent.last_report`` and ``self.parent.last_certification``
-    :param n_eval_episodes: Number of episodes for each of the three
+    :param n_episodes: Number of episodes for each of the three
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param ultimate_bound: The cost to stay within, the largest late cost of the roll-outs of the fit by default
     :param seed: Seed of each evaluation, far from those of the training; if it is None, each draws its own
@@ -167,17 +168,18 @@ class CertificateCallback(LyapunovCallback):
     #: Statements whose bounds are logged
     STATEMENTS: ClassVar[tuple[str, ...]] = ("survives", "stays_within", "decreases")
 
+    @by_keyword
     def __init__(
         self,
         eval_env: gym.Env | VecEnv,
         callback_after_eval: BaseCallback | None = None,
-        n_eval_episodes: int = 100,
+        n_episodes: int = 100,
         eval_freq: int = 10_000,
         ultimate_bound: float | None = None,
         seed: int | None = 10_000,
         verbose: int = 1,
     ):
-        super().__init__(eval_env, callback_after_eval, n_eval_episodes, eval_freq, seed, verbose)
+        super().__init__(eval_env, callback_after_eval, n_episodes, eval_freq, seed, verbose)
         check_bound(ultimate_bound)
         self.ultimate_bound = ultimate_bound
         self.last_certification: CertificationReport | None = None
@@ -187,15 +189,17 @@ class CertificateCallback(LyapunovCallback):
 
     def _evaluate(self) -> float:
         self.last_report = self.last_certification = None
-        model, env, n_episodes = self.model, self.eval_env, self.n_eval_episodes
+        model, env, n_episodes, bound = self.model, self.eval_env, self.n_episodes, self.ultimate_bound
         try:
-            lyapunov = fit_lyapunov(model, env, n_episodes, seed=self.seed, progress_bar=False)
+            lyapunov = fit_lyapunov(model, env, n_episodes=n_episodes, seed=self.seed, progress_bar=False)
         except NoCostError as nothing:
             return nothing.mean_reward
         seed = lyapunov.seeds.stop
-        self.last_report = evaluate_lyapunov(model, env, n_episodes, seed=seed, lyapunov=lyapunov)
+        self.last_report = evaluate_lyapunov(model, env, n_episodes=n_episodes, seed=seed, lyapunov=lyapunov)
         seed += env.num_envs
-        self.last_certification = certify(model, env, lyapunov, n_episodes, ultimate_bound=self.ultimate_bound, seed=seed)
+        self.last_certification = certify(
+            model, env, lyapunov=lyapunov, n_episodes=n_episodes, ultimate_bound=bound, seed=seed
+        )
         return mean_reward(self.last_report.transitions)
 
     def _values(self) -> dict[str, float]:

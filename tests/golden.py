@@ -250,11 +250,11 @@ def certificates() -> Numbers:
     ):
         env = gym.make(env_id)
         policy = controller or reference_controller(env)
-        lyapunov = fit_lyapunov(policy, env, 8, seed=0)
-        report = evaluate_lyapunov(policy, env, 8, lyapunov=lyapunov, seed=1000)
+        lyapunov = fit_lyapunov(policy, env, n_episodes=8, seed=0)
+        report = evaluate_lyapunov(policy, env, n_episodes=8, lyapunov=lyapunov, seed=1000)
         for metric, interval in report.metrics.items():
             yield f"certificate/{name}/{env_id}/{metric}", np.array(interval)
-        found = certify(policy, env, lyapunov, 8, seed=2000)
+        found = certify(policy, env, lyapunov=lyapunov, n_episodes=8, seed=2000)
         for statement, row in found.statements.iterrows():
             yield f"certificate/{name}/{env_id}/statement/{statement}", row.to_numpy(dtype=float)
         values = [np.nan if each is None else each for each in (found.ultimate_bound, found.level, found.window_steps)]
@@ -282,7 +282,7 @@ def trainings() -> Numbers:
             frame = evaluate(PolicyEstimator(model, id_), discharges).drop(columns="time_per_update_s")
             yield f"training/{id_}/evaluate", frame.select_dtypes("number").to_numpy()
         if id_ == "LinearCost-v0":
-            report = evaluate_lyapunov(model, gym.make(id_), n_eval_episodes=5, seed=0)
+            report = evaluate_lyapunov(model, gym.make(id_), n_episodes=5, seed=0)
             for metric, interval in report.metrics.items():
                 yield f"evaluate_lyapunov/{metric}", np.array(interval)
 

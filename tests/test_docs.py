@@ -3,6 +3,7 @@
 import re
 import shlex
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -10,7 +11,10 @@ from battery_env.__main__ import calibrate
 from battery_env.estimators.reasons import Doubt, Reason
 from battery_env.parameters import PARAMETER_NAMES
 from checks.pages import DOCS, PAGES, ROOT, blocks, docstring_examples
-from sb3_lac.stability import fitting
+from sb3_lac.costs import advice_for_a_time_limit
+from sb3_lac.stability import NoCostError, fitting, report
+from sb3_lac.stability.certification import NEEDS, OWN_BOUND
+from sb3_lac.stability.rollout import where_it_rests
 from tests.sweeps import sweep
 
 # What an example needs that no installation for the tests has: it is skipped there.
@@ -43,7 +47,7 @@ def run_briefly(source, name, folder, monkeypatch):
     source = re.sub(r"\beval_freq=[\d_]+", "eval_freq=100", source)
     source = re.sub(r"\bfor seed in range\(\d+\)", "for seed in range(1)", source)
     source = re.sub(r"\bn_steps: int = [\d_]+", "n_steps: int = 520", source)
-    source = re.sub(r"\b(n_envs|n_episodes|n_eval_episodes)=\d+", r"\1=10", source)
+    source = re.sub(r"\b(n_envs|n_episodes)=\d+", r"\1=10", source)
     source = re.sub(r"\bn_episodes_per_start=\d+", "n_episodes_per_start=2", source)
     exec(compile(source, name, "exec"), {"__name__": "__main__"})
 
@@ -106,6 +110,16 @@ def test_reasons_can_be_looked_up_by_their_own_words():
     named = [words for row in re.findall(r"^\| (\".*?) \|", text, flags=re.MULTILINE) for words in re.findall('"(.*?)"', row)]
     texts = [row.text for row in (*Reason, *Doubt)] + [Reason.IMPRECISE.said(number, {}) for number in PARAMETER_NAMES]
     assert named and not [words for words in named if not any(words in text for text in texts)]
+
+
+def test_what_the_summaries_of_a_loop_say_against_it_has_a_row_of_remedies_each():
+    text = (DOCS / "judge_any_loop.md").read_text(encoding="utf-8")
+    rows = re.findall(r'^\| "(.*?)"(.*?) \|', text, flags=re.MULTILINE)
+    said = [reason.value for reason in report.Reason] + [report.SHORT, str(NoCostError(0.0)), OWN_BOUND, *NEEDS]
+    said += [advice_for_a_time_limit(np.array([5, 5])), where_it_rests(late_cost=0.5, start_cost=1.0)]
+    assert [sum(words in each for words, _ in rows) for each in said] == [1] * len(said)
+    assert [sum(words in each for each in said) for words, _ in rows] == [1] * len(rows)
+    assert {words for words, rest in rows if rest == ", not made"} == set(NEEDS)
 
 
 def test_the_first_screen_names_the_interval_that_its_block_prints(capsys):

@@ -14,16 +14,18 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_lac.checks import advice_for_a_time_limit
 from sb3_lac.stability.functions import LyapunovFunction
-from sb3_lac.stability.loop import ClosedLoop, closed_loop
-from sb3_lac.stability.rollout import flatten, summarize_episodes
+from sb3_lac.stability.loop import ClosedLoop, by_keyword, closed_loop
+from sb3_lac.stability.rollout import flatten, summarize_episodes, where_it_rests
 from sb3_lac.stability.statistics import CONFIDENCE, exact_interval, exact_lower_bound
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+#: What is said of a bound that brings its own measure
+OWN_BOUND = "The bound is this loop's own. To compare loops, state one for all of them: ultimate_bound=..."
 #: What it takes to make a statement that not every certification makes
-_NEEDS = {
+NEEDS = {
     "stays_within": "an ultimate_bound: give one, or a fitted function, whose roll-outs have one",
     "decreases": "a function with a level and window_steps, as that of fit_lyapunov(policy, env) if it falls, and an episode "
     "that starts above that level and is longer than that",
@@ -45,6 +47,7 @@ class CertificationReport:
     :param starts: One row per start state on the grid: ``state_0`` and so on, ``n_episodes``, ``n_attracted``, their ``share``
         with its exact interval ``low`` and ``high``; None if no start states were given
     :param ultimate_bound: The cost to stay within, None if there is none
+    :param own_bound: Whether that is the one of the function, which only this loop is measured by
     :param level: Value of the function above which it has to decrease, None if there is none
     :param window_steps: Over how many steps, None if there is none
     :param description: The policy, the environment and the seed
@@ -55,6 +58,7 @@ class CertificationReport:
     episodes: pd.DataFrame
     starts: pd.DataFrame | None
     ultimate_bound: float | None
+    own_bound: bool
     level: float | None
     window_steps: int | None
     description: str
@@ -79,9 +83,14 @@ class CertificationReport:
             counts = f"{row['n_true']:.0f} of {row['n_episodes']:.0f}"
             at_least = math.floor(1e4 * row["at_least"]) / 1e4  # a lower bound is not rounded up
             lines.append(f"  {name:<14}{counts:>14}   {at_least:.4f}   {self._meaning(str(name))}")
-        for name, needs in _NEEDS.items():
+        for name, needs in NEEDS.items():
             if name not in self.statements.index:
                 lines.append(f"  {name:<14}{'not made':>14}   it takes {needs}")
+        start_cost, late_cost = self._start_cost(), self.episodes.loc[self.episodes["survives"] == 1, "late_cost"].mean()
+        if self.ultimate_bound is not None and late_cost < start_cost:
+            lines.append(f"Where it survives, the loop {where_it_rests(late_cost, start_cost)}")
+        if self.own_bound:
+            lines.append(OWN_BOUND)
         lines.append(
             f"Together with {100 * CONFIDENCE:g} % confidence: each bound is that of Clopper and Pearson with "
             f"{100 * self.confidence_of_each:.4g} % (Bonferroni)."
@@ -99,15 +108,16 @@ class CertificationReport:
         )
         return "\n".join(lines)
 
+    def _start_cost(self) -> float:
+        return float(self.transitions.loc[self.transitions["step"] == 0, "cost"].mean())
+
     def _meaning(self, name: str) -> str:
         if name == "survives":
             advice = advice_for_a_time_limit(self.episodes["length"].to_numpy()) if self.episodes["terminated"].any() else ""
             return f"no termination. {advice}".rstrip(". ")
         if name == "stays_within":
-            start_cost = self.transitions.loc[self.transitions["step"] == 0, "cost"].mean()
-            return (
-                f"survives, and no cost in the last fifth is above {self.ultimate_bound:.3g} (first steps: {start_cost:.3g})"
-            )
+            bound, start_cost = self.ultimate_bound, self._start_cost()
+            return f"survives, and no cost in the last fifth is above {bound:.3g} (first steps: {start_cost:.3g})"
         return f"L falls over every {self.window_steps} steps that begin with L above {self.level:.3g}"
 
     def plot(self) -> Figure:
@@ -118,7 +128,7 @@ class CertificationReport:
         """
         from sb3_lac.stability import plots  # matplotlib is slow to import, and only a figure needs it
 
-        return plots.plot_certification(self.statements, self.transitions, self.ultimate_bound)
+        return plots.plot_certification(self.statements, self.transitions, self.ultimate_bound, self.own_bound)
 
     def plot_region_of_attraction(self, x: int = 0, y: int = 1, names: Sequence[str] | None = None) -> Figure:
         """
@@ -136,9 +146,11 @@ class CertificationReport:
         return plots.plot_region_of_attraction(self.starts, x, y, names)
 
 
+@by_keyword
 def certify(
     policy: PolicyPredictor,
     env: gym.Env | VecEnv,
+    *,
     lyapunov: LyapunovFunction | None = None,
     n_episodes: int = 300,
     ultimate_bound: float | None = None,
@@ -159,7 +171,7 @@ def certify(
       env = gym.make("LinearCost-v0")
       controller = reference_controller(env)  # or a model of any algorithm
       lyapunov = fit_lyapunov(controller, env, n_episodes=20, seed=0)
-      print(certify(controller, env, lyapunov, n_episodes=100, seed=1000).summary())
+      print(certify(controller, env, lyapunov=lyapunov, n_episodes=100, seed=1000).summary())
 
     Each statement is a question that an episode answers with yes or no. The bound is that of Clopper and Pearson (1934), which
     only assumes independent episodes: 300 of 300 means at least 99 % for one statement, and 98.6 % for each of three. The
@@ -177,7 +189,8 @@ def certify(
     :param env: The environment, wrapped as that of the training. Several at once are faster.
     :param lyapunov: The function, if decrease is to be certified
     :param n_episodes: Number of episodes
-    :param ultimate_bound: The cost to stay within, that of ``lyapunov`` by default
+    :param ultimate_bound: The cost to stay within, that of ``lyapunov`` by default. Each fit brings another one: to compare
+        loops, state one for all of them.
     :param starts: Start states on a grid, shape (n, n_states), each handed to ``env.reset(options={"state": ...})``
     :param n_episodes_per_start: Number of episodes from each of them
     :param deterministic: Whether to certify the mean action or sampled actions
@@ -195,6 +208,7 @@ def certify(
                 f"n_episodes_per_start={n_episodes_per_start} at least 1."
             )
     with closed_loop(policy, env, lyapunov, n_episodes, deterministic, seed) as loop:
+        own_bound = ultimate_bound is None and lyapunov is not None and lyapunov.ultimate_bound is not None
         if ultimate_bound is None and lyapunov is not None:
             ultimate_bound = lyapunov.ultimate_bound
         attraction = None
@@ -214,6 +228,7 @@ def certify(
         episodes=episodes,
         starts=attraction,
         ultimate_bound=ultimate_bound,
+        own_bound=own_bound,
         level=level,
         window_steps=window_steps,
         description=description,

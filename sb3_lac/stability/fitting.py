@@ -15,16 +15,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_lac.stability.functions import LyapunovFunction, Observations
-from sb3_lac.stability.loop import closed_loop
+from sb3_lac.stability.loop import by_keyword, closed_loop
 from sb3_lac.stability.rollout import RollOuts, fifths_left, flatten, mean_reward, summarize_episodes
 
 if TYPE_CHECKING:
     import pandas as pd
 
-#: Widths of the hidden layers
-NET_ARCH = (64, 64)
-#: Outputs whose squares are summed
-N_FEATURES = 16
+#: Widths of the layers; the squares of the outputs of the last one are summed
+NET_ARCH = (64, 64, 16)
 #: Passes over the data
 N_ITERATIONS = 40
 #: Transitions of each gradient step
@@ -47,7 +45,7 @@ class SumOfSquares(nn.Module):
     def __init__(self, n_inputs: int):
         super().__init__()
         # Smooth, for the slope of L is what a plot shows
-        self.features = nn.Sequential(*create_mlp(n_inputs, N_FEATURES, list(NET_ARCH), nn.SiLU))
+        self.features = nn.Sequential(*create_mlp(n_inputs, NET_ARCH[-1], list(NET_ARCH[:-1]), nn.SiLU))
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         return th.sum(self.features(inputs) ** 2, dim=-1)
@@ -96,7 +94,9 @@ class InputRange:
 
 class FittedLyapunov(LyapunovFunction):
     """
-    A Lyapunov function that ``fit_lyapunov()`` learned: a network, and what its roll-outs say about the loop.
+    A Lyapunov function that ``fit_lyapunov()`` learned: a network, and what its roll-outs say about the loop. Of the episodes
+    that did not terminate, ``ultimate_bound`` is the largest cost in their last fifth, ``level`` the largest value there, and
+    ``window_steps`` the shortest window over which the function decreased wherever it started above that level.
 
     :param network: Sum of squares of the scaled observations
     :param inputs: The observations that it has seen
@@ -104,10 +104,6 @@ class FittedLyapunov(LyapunovFunction):
     :param floor: The least value on the roll-outs, which is subtracted: values below it are 0
     :param average_cost: Cost per step where the loop settles
     :param reward_bound: The reward that costs nothing
-    :param ultimate_bound: Largest cost in the last fifth of those episodes that did not terminate, None if there are none
-    :param level: Largest value in the last fifth of those episodes, None if there are none
-    :param window_steps: The shortest window over which the function decreased wherever it started above ``level``, in all of
-        those episodes; None if there is none
     :param seeds: Seeds of the environments of the roll-outs
     """
 
@@ -121,9 +117,6 @@ class FittedLyapunov(LyapunovFunction):
         floor: float,
         average_cost: float,
         reward_bound: float,
-        ultimate_bound: float | None,
-        level: float | None,
-        window_steps: int | None,
         seeds: range,
     ):
         super().__init__(self._of_network, reward_bound=reward_bound)
@@ -132,9 +125,6 @@ class FittedLyapunov(LyapunovFunction):
         self.unit = unit
         self.floor = floor
         self.average_cost = average_cost
-        self.ultimate_bound = ultimate_bound
-        self.level = level
-        self.window_steps = window_steps
         self.seeds = seeds
 
     def _of_network(self, observations: Observations) -> np.ndarray:
@@ -145,9 +135,11 @@ class FittedLyapunov(LyapunovFunction):
         return np.maximum(self.unit * self.network.values(self.inputs.scaled(inputs)) - self.floor, 0.0)
 
 
+@by_keyword
 def fit_lyapunov(
     policy: PolicyPredictor,
     env: gym.Env | VecEnv,
+    *,
     n_episodes: int = 100,
     deterministic: bool = True,
     seed: int | None = None,
@@ -318,17 +310,15 @@ def _described(
         raise ValueError("The fit diverged: its values are not finite.")
     floor = float(values.min())
     values = values - floor
+    lyapunov = FittedLyapunov(network, data.inputs, data.unit, floor, average_cost, reward_bound, seeds)
     episodes = summarize_episodes(transitions)
     survived = ~episodes["terminated"].to_numpy()
-    ultimate_bound = level = window_steps = None
     if survived.any():
         late = (fifths_left(transitions) == 0).to_numpy() & survived[transitions["episode"]]
-        level = float(values[late].max())
-        window_steps = shortest_window(values, data.rows[survived], level)
-        ultimate_bound = float(episodes["largest_late_cost"][survived].max())
-    return FittedLyapunov(
-        network, data.inputs, data.unit, floor, average_cost, reward_bound, ultimate_bound, level, window_steps, seeds
-    )
+        lyapunov.level = float(values[late].max())
+        lyapunov.window_steps = shortest_window(values, data.rows[survived], lyapunov.level)
+        lyapunov.ultimate_bound = float(episodes["largest_late_cost"][survived].max())
+    return lyapunov
 
 
 def shortest_window(values: np.ndarray, rows: np.ndarray, level: float) -> int | None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import random
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -36,6 +39,37 @@ if TYPE_CHECKING:
 
 #: Transitions whose ``L`` is computed at once
 CHUNK_SIZE = 2048
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def by_keyword(function: Function) -> Function:
+    """
+    Accept arguments by their places and names of 0.6 too, with a warning that says what to write.
+
+    :param function: A function whose keyword-only arguments stand in the order of their old places
+    :return: The function for both forms
+    """
+    parameters = inspect.signature(function).parameters.values()
+    names = [parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
+    n_places = len(parameters) - len(names)
+
+    @functools.wraps(function)
+    def of_both_forms(*arguments: Any, **given: Any) -> Any:
+        old = dict(zip(names, arguments[n_places:], strict=False))
+        if "n_eval_episodes" in given:
+            old["n_episodes"] = given.pop("n_eval_episodes")
+        if old:
+            written = ", ".join(f"{name}=..." for name in old)
+            warnings.warn(
+                f"{function.__qualname__}: write {written}. Another name, or none, is an error from 0.8 on.",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+        # What is one too many stays where it is, and is refused
+        return function(*arguments[:n_places], *arguments[n_places + len(names) :], **old, **given)
+
+    return of_both_forms  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, eq=False)

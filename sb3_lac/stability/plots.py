@@ -110,14 +110,14 @@ def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
     axes.legend(fontsize=8)
 
 
-def draw_costs(transitions: pd.DataFrame, ultimate_bound: float, axes: Axes) -> None:
+def draw_costs(transitions: pd.DataFrame, bound: float, name: str, axes: Axes) -> None:
     """Draw the costs over time."""
     low, median, high = transitions.groupby("step")["cost"].quantile(np.array([0.1, 0.5, 0.9])).unstack().to_numpy().T
     steps = np.arange(len(median))
     axes.fill_between(steps, low, high, color=BLUE, alpha=0.2, lw=0, label="10 % to 90 % of the episodes")
     axes.plot(steps, median, color=BLUE, lw=1.4, label="median")
-    if not math.isnan(ultimate_bound):
-        axes.axhline(ultimate_bound, color=ORANGE, ls="--", lw=1.2, label=f"ultimate bound {ultimate_bound:.2g}")
+    if not math.isnan(bound):
+        axes.axhline(bound, color=ORANGE, ls="--", lw=1.2, label=f"{name} {bound:.2g}")
     set_log_scale(axes, "y", low)
     axes.set(xlabel="step", ylabel="cost", title="Costs over time")
     axes.legend(fontsize=8)
@@ -130,7 +130,7 @@ def plot_report(transitions: pd.DataFrame, by_cost: pd.DataFrame, alpha3: float,
     draw_episodes(transitions, along_episodes)
     draw_by_cost(by_cost, alpha3, of_decrease)
     draw_calibration(transitions, of_calibration)
-    draw_costs(transitions, ultimate_bound, of_costs)
+    draw_costs(transitions, ultimate_bound, "ultimate bound", of_costs)
     return figure
 
 
@@ -160,7 +160,9 @@ def plot_drift(by_cost: pd.DataFrame, cost_bound: float, cost_bound_alpha3: floa
     return figure
 
 
-def plot_certification(statements: pd.DataFrame, transitions: pd.DataFrame, ultimate_bound: float | None) -> Figure:
+def plot_certification(
+    statements: pd.DataFrame, transitions: pd.DataFrame, ultimate_bound: float | None, own_bound: bool
+) -> Figure:
     """See ``CertificationReport.plot()``."""
     figure = new_figure(9.5, 3.6)
     of_statements, of_costs = figure.subplots(1, 2)
@@ -178,7 +180,8 @@ def plot_certification(statements: pd.DataFrame, transitions: pd.DataFrame, ulti
         title="With 95 % confidence",
     )
     of_statements.legend(fontsize=8, loc="lower left", ncols=2)
-    draw_costs(transitions, math.nan if ultimate_bound is None else ultimate_bound, of_costs)
+    bound = math.nan if ultimate_bound is None else ultimate_bound
+    draw_costs(transitions, bound, "bound of this loop alone" if own_bound else "stated bound", of_costs)
     return figure
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from enum import Enum
+from typing import TYPE_CHECKING, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -14,8 +15,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_lac.checks import advice_for_a_time_limit
 from sb3_lac.cost_algorithm import CostAlgorithm
 from sb3_lac.stability.functions import CriticLyapunov, LyapunovFunction
-from sb3_lac.stability.loop import closed_loop
-from sb3_lac.stability.rollout import summarize_episodes
+from sb3_lac.stability.loop import by_keyword, closed_loop
+from sb3_lac.stability.rollout import summarize_episodes, where_it_rests
 from sb3_lac.stability.statistics import (
     Bootstrap,
     Interval,
@@ -31,6 +32,32 @@ if TYPE_CHECKING:
 
 #: Columns of the transitions of a report
 _COLUMNS = ["episode", "step", "reward", "cost", "lyapunov", "next_lyapunov", "difference", "cost_to_go", "terminated"]
+#: What is said where more episodes may turn a verdict round
+SHORT = "short of episodes"
+
+
+class Reason(Enum):
+    """Why a loop is not shown to hold, in words that start a row of remedies in ``docs/judge_any_loop.md``."""
+
+    DIED = "episodes died"
+    INFINITE = "L is not finite everywhere"
+    FREE = "too few episodes have a cost"
+    L_RISES = "L does not fall from the starts on"
+    RISES_FAR_OUT = "L does not decrease where the cost is largest"
+    COST_RISES = "the cost rises where the roll-outs end"
+    UNSETTLED = "the loop is not known to settle below the cost of its first steps"
+
+
+class _Finding(NamedTuple):
+    """What speaks against a loop, what was measured of it, and the number of episodes that tell, None if these do."""
+
+    reason: Reason
+    measured: str
+    enough: int | None = None
+
+
+def _shown(interval: Interval) -> str:
+    return f"{interval.value:.3g} [{interval.low:.3g}, {interval.high:.3g}]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +114,8 @@ class LyapunovReport:
         :return: A text of some lines
         """
         episodes, transitions = len(self.episodes), len(self.transitions)
-        verdict = (
-            f"{'HOLDS' if self.holds else 'NOT SHOWN'}: {self._verdict_with_residual()}\n"
-            f"Seen in {episodes} episodes, {transitions} transitions of this policy in this environment: measured, not proved."
-        )
+        seen = f"{episodes} episodes, {transitions} transitions of this policy in this environment"
+        verdict = f"{self._verdict_with_residual()}\nSeen in {seen}: measured, not proved."
         return verdict if not full else f"{verdict}\n\n{self._details()}"
 
     def _details(self) -> str:
@@ -128,45 +153,74 @@ class LyapunovReport:
     @property
     def holds(self) -> bool:
         """
-        Whether these roll-outs show a Lyapunov function with a residual: no episode died, ``L`` falls from the starts on (the
-        interval of ``largest_feasible_alpha3`` lies above 0), and it decreases wherever the cost is larger than
-        ``cost_bound``, whose interval lies below the mean cost of the first steps. Where the roll-outs end, the cost must not
-        rise (the interval of ``late_rise`` lies above 0) so that one more such rise exceeds the bound.
+        Whether these roll-outs show a Lyapunov function with a residual: no episode died, ``L`` falls from the starts on, and
+        wherever the cost is larger than ``cost_bound``, which lies below the cost of the first steps, and where the roll-outs
+        end, the cost does not rise so that one more such rise exceeds that bound.
         """
-        return self._why_not() is None
+        return not self._findings()
 
-    def _why_not(self) -> str | None:
-        metrics = self.metrics
+    def _findings(self) -> list[_Finding]:
+        """Return what speaks against the loop, in the order of the verdict."""
+        metrics, n_episodes = self.metrics, len(self.episodes)
         if metrics["death_rate"].value > 0:
-            died = f"{self.episodes['terminated'].sum()} of {len(self.episodes)} episodes died"
-            return f"{died}. {advice_for_a_time_limit(self.episodes['length'].to_numpy())}".rstrip(". ")
+            advice = advice_for_a_time_limit(self.episodes["length"].to_numpy())
+            return [_Finding(Reason.DIED, f"({self.episodes['terminated'].sum()} of {n_episodes}). {advice}".rstrip(". "))]
         if not np.isfinite(self.transitions["lyapunov"]).all():
-            return "L is not finite everywhere, as with gamma=1 and positive rewards"
-        if math.isnan(metrics["largest_feasible_alpha3"].low) and metrics["largest_feasible_alpha3"].value > 0:
-            return "too few episodes have a cost for an interval, use more"
-        if not metrics["largest_feasible_alpha3"].low > 0:
-            return "L does not fall from the starts on (the interval of largest_feasible_alpha3 is not above 0)"
+            return [_Finding(Reason.INFINITE, "(as with gamma=1 and positive rewards)")]
+        alpha3, bound, start = metrics["largest_feasible_alpha3"], metrics["cost_bound"], metrics["start_cost"].value
+        if math.isnan(alpha3.low):
+            n_costly = (self.episodes["total_cost"] > 0).sum()
+            return [_Finding(Reason.FREE, f"({n_costly} of {n_episodes})", self._enough(alpha3) if n_costly > 0 else None)]
+        found = []
+        if not alpha3.low > 0:
+            found.append(_Finding(Reason.L_RISES, f"(largest_feasible_alpha3 is {_shown(alpha3)})", self._enough(alpha3)))
         if math.isnan(metrics["cost_bound_alpha3"].value):
-            return "L does not decrease where the cost is largest"
-        late_cost, late_rise = metrics["late_cost"].value, metrics["late_rise"].value
-        if metrics["late_rise"].low > 0 and late_cost + late_rise > metrics["cost_bound"].value:
-            return (
-                f"the cost rises where the roll-outs end, in the last fifth by {late_rise:.3g} above the three before, to "
-                f"{late_cost:.3g}: it would soon be above cost_bound"
-            )
-        if not metrics["cost_bound"].high < metrics["start_cost"].value:
-            return (
-                "the interval of cost_bound is not below the cost of the first steps, and so the loop is not known to settle "
-                "there"
-            )
-        return None
+            costly = self.by_cost.iloc[-1]
+            asked = self.alpha3 * costly["cost"]
+            drift = Interval(costly["drift"], costly["decrease_low"] - asked, costly["decrease_high"] - asked)
+            found.append(_Finding(Reason.RISES_FAR_OUT, f"(its drift there is {_shown(drift)})", self._enough(drift)))
+        if metrics["late_rise"].low > 0 and self._late_rise_matters():
+            rise, late_cost = metrics["late_rise"].value, metrics["late_cost"].value
+            late = f"(in the last fifth by {rise:.3g} above the three before, to {late_cost:.3g}, and soon above cost_bound)"
+            found.append(_Finding(Reason.COST_RISES, late))
+        if not bound.high < start:
+            enough = self._enough(Interval(bound.value - start, bound.low - start, bound.high - start))
+            found.append(_Finding(Reason.UNSETTLED, f"({start:.3g}, and cost_bound is {_shown(bound)})", enough))
+        return found
+
+    def _late_rise_matters(self) -> bool:
+        """Whether the cost exceeds the bound once it rises as in the last fifth again."""
+        return sum(self.metrics[name].value for name in ("late_cost", "late_rise")) > self.metrics["cost_bound"].value
+
+    def _enough(self, margin: Interval) -> int | None:
+        """
+        Return how many episodes are likely to tell on which side of 0 a margin is, if it is as large as it seems, give or take
+        its standard deviation: widths fall with the root of their number. None if its interval tells already.
+        """
+        value, low, high = margin
+        if math.isnan(low):  # at least one episode has data, and it takes some four
+            return 4 * len(self.episodes)
+        if not low < 0 < high:
+            return None
+        # Half of a 95 % interval is two standard deviations; twice as many as just enough do in four of five cases
+        width = value - low if value > 0 else high - value
+        return math.ceil(2 * width**2 / (value**2 + (width / 2) ** 2)) * len(self.episodes)
 
     def _verdict_with_residual(self) -> str:
-        reason = self._why_not()
-        if reason is not None:
-            return f"{reason}."
-        bound, start = self.metrics["cost_bound"].high, self.metrics["start_cost"].value
-        return f"the mean cost settles below {bound:.3g} (the starts cost {start:.3g}). L decreases wherever it is larger."
+        found, metrics, n_episodes = self._findings(), self.metrics, len(self.episodes)
+        decided = [each for each in found if each.enough is None]
+        if decided:
+            return f"NOT SHOWN: {decided[0].reason.value} {decided[0].measured}."
+        if found:
+            most = max(each.enough for each in found if each.enough is not None)
+            why = f"{found[0].reason.value} {found[0].measured}"
+            return f"NOT SHOWN, and {SHORT}: {why}. {n_episodes} do not tell, n_episodes={most} may."
+        start, enough = metrics["start_cost"].value, self._enough(metrics["late_rise"]) if self._late_rise_matters() else None
+        rises = "" if enough is None else f" But {SHORT}: whether {Reason.COST_RISES.value}, n_episodes={enough} may tell."
+        return (
+            f"HOLDS, and {where_it_rests(metrics['late_cost'].value, start)} The mean cost settles below "
+            f"{metrics['cost_bound'].high:.3g} (the starts cost {start:.3g}). L decreases wherever it is larger.{rises}"
+        )
 
     def plot(self) -> Figure:
         """
@@ -193,10 +247,12 @@ class LyapunovReport:
         return plots.plot_drift(self.by_cost, bound, alpha3, self.metrics["start_cost"].value)
 
 
+@by_keyword
 def evaluate_lyapunov(
     policy: PolicyPredictor,
     env: gym.Env | VecEnv,
-    n_eval_episodes: int = 20,
+    *,
+    n_episodes: int = 20,
     deterministic: bool = True,
     seed: int | None = None,
     lyapunov: LyapunovFunction | None = None,
@@ -214,7 +270,7 @@ def evaluate_lyapunov(
       env = gym.make("LinearCost-v0")
       controller = reference_controller(env)  # or a model of any algorithm
       lyapunov = fit_lyapunov(controller, env, n_episodes=20, seed=0)
-      report = evaluate_lyapunov(controller, env, n_eval_episodes=20, lyapunov=lyapunov, seed=1000)
+      report = evaluate_lyapunov(controller, env, n_episodes=20, lyapunov=lyapunov, seed=1000)
       print(report.summary())
 
     Take the function of ``fit_lyapunov()`` for a verdict on the loop. Without ``lyapunov``, the critic of LAC is judged, which
@@ -231,7 +287,7 @@ def evaluate_lyapunov(
     :param policy: The policy: a model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
     :param env: The gym environment or ``VecEnv`` environment, not the one that the policy trains in. Its normalization
         statistics are used as they are: call ``sync_envs_normalization()`` before.
-    :param n_eval_episodes: Number of episodes, divided onto the elements of a vector env as in ``evaluate_policy()``
+    :param n_episodes: Number of episodes, divided onto the elements of a vector env as in ``evaluate_policy()``
     :param deterministic: Whether to judge the policy's mean action, as it is used after the training, or sampled actions
     :param seed: Seed for ``env`` and for the actions; drawn if it is None, and kept in the report
     :param lyapunov: The function to judge, the critic by default. It cannot be judged on roll-outs that it was fitted on.
@@ -240,8 +296,8 @@ def evaluate_lyapunov(
     """
     if lyapunov is None:
         lyapunov = critic_of(policy)
-    with closed_loop(policy, env, lyapunov, n_eval_episodes, deterministic, seed) as loop:
-        roll_outs = loop.roll_out(n_eval_episodes)
+    with closed_loop(policy, env, lyapunov, n_episodes, deterministic, seed) as loop:
+        roll_outs = loop.roll_out(n_episodes)
         transitions = roll_outs.transitions
         loop.check_costs(transitions["reward"])
     transitions["difference"] = transitions["next_lyapunov"] - transitions["lyapunov"] + lyapunov.alpha3 * transitions["cost"]

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Steps after which an episode is suspected to have no end
 MANY_STEPS = 10_000
+#: Share of the cost of the starts, below which a loop is taken to rest at its goal
+SETTLED_SHARE = 0.1
 
 
 def combine(function: Callable[[list[np.ndarray]], np.ndarray], observations: Sequence[Observations]) -> Observations:
@@ -203,6 +205,12 @@ def fifths_left(transitions: pd.DataFrame) -> pd.Series:
 def mean_reward(transitions: pd.DataFrame) -> float:
     """Return the mean over episodes of the sum of their rewards."""
     return float(transitions["reward"].sum() / transitions["episode"].nunique())
+
+
+def where_it_rests(late_cost: float, start_cost: float) -> str:
+    """Say at which share of the cost of the starts a loop rests, and ask whether that is the goal."""
+    share = late_cost / start_cost
+    return f"rests at {100 * share:.3g} % of the start's cost{': beside the goal?' if share >= SETTLED_SHARE else '.'}"
 
 
 def summarize_episodes(transitions: pd.DataFrame) -> pd.DataFrame:

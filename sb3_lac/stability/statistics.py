@@ -80,8 +80,9 @@ class Bootstrap:
         sums = np.zeros((len(values), self.n_episodes, n_levels))
         for total, value in zip(sums, values, strict=True):
             np.add.at(total, (np.asarray(episode), level), value)
-        whole = statistic(*sums.sum(axis=1), *(np.sum(values) for values in of_episodes))
-        return self._interval(float(whole), statistic(*(self.counts @ sums), *(self.counts @ value for value in of_episodes)))
+        whole = [*sums.sum(axis=1), *(np.sum(value) for value in of_episodes)]
+        samples = [*(self.counts @ sums), *(self.counts @ value for value in of_episodes)]
+        return self._interval(float(statistic(*whole)), statistic(*samples))
 
     def _interval(self, value: float, samples: np.ndarray) -> Interval:
         defined = samples[np.isfinite(samples)]

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 import random
+import re
 import warnings
 
 import gymnasium as gym
@@ -22,8 +23,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from benchmarks.control import ScaledController
 from sb3_lac import CertificateCallback, GymnasiumVecEnv, LyapunovCallback, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import LinearCostEnv, reference_controller
-from sb3_lac.stability import CriticLyapunov, LyapunovFunction, fitting
+from sb3_lac.stability import CriticLyapunov, Interval, LyapunovFunction, fitting
 from sb3_lac.stability.fitting import shortest_window, traced_returns
+from sb3_lac.stability.report import SHORT, Reason
 from sb3_lac.stability.statistics import exact_interval, exact_lower_bound, tightest_drift
 
 FIT = {"progress_bar": False}
@@ -44,7 +46,7 @@ def linear_env():
 @pytest.fixture(scope="module")
 def optimal(linear_env):
     controller = reference_controller(gym.make("LinearCost-v0"))
-    return controller, fit_lyapunov(controller, linear_env, 50, seed=0, **FIT)
+    return controller, fit_lyapunov(controller, linear_env, n_episodes=50, seed=0, **FIT)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +64,7 @@ def exact():
 def test_function_of_the_optimal_loop_is_the_exact_one(optimal, linear_env, exact):
     controller, lyapunov = optimal
     function, _, average_cost = exact
-    report = evaluate_lyapunov(controller, linear_env, 50, seed=100, lyapunov=lyapunov)
+    report = evaluate_lyapunov(controller, linear_env, n_episodes=50, seed=100, lyapunov=lyapunov)
     values, learned = function.values(report.observations), report.transitions["lyapunov"].to_numpy()
     assert np.corrcoef(values, learned)[0, 1] > 0.998
     assert np.polyfit(values, learned, 1)[0] == pytest.approx(1.0, abs=0.05)
@@ -71,7 +73,7 @@ def test_function_of_the_optimal_loop_is_the_exact_one(optimal, linear_env, exac
     assert average_cost * 0.8 < report.metrics["cost_bound"].value < average_cost * 1.5
     assert report.metrics["calibration_slope"].value == pytest.approx(1.0, abs=0.05)
     assert report.metrics["death_rate"].value == 0
-    statements = certify(controller, linear_env, lyapunov, 59, seed=200).statements
+    statements = certify(controller, linear_env, lyapunov=lyapunov, n_episodes=59, seed=200).statements
     assert statements.index.tolist() == ["survives", "stays_within", "decreases"]
     assert statements["share"].min() > 0.9 and statements["at_least"].min() > 0.8
 
@@ -81,11 +83,11 @@ def test_destabilised_loop_fails(linear_env, optimal, factor):
     env = LinearCostEnv()
     assert np.abs(np.linalg.eigvals(env.A - factor * env.B @ env.optimal_gain())).max() > 1.005
     controller = ScaledController(optimal[0], factor)
-    lyapunov = fit_lyapunov(controller, linear_env, 30, seed=0, **FIT)
-    report = evaluate_lyapunov(controller, linear_env, 30, seed=100, lyapunov=lyapunov)
+    lyapunov = fit_lyapunov(controller, linear_env, n_episodes=30, seed=0, **FIT)
+    report = evaluate_lyapunov(controller, linear_env, n_episodes=30, seed=100, lyapunov=lyapunov)
     assert not report.holds and report.metrics["largest_feasible_alpha3"].high < 0
     assert report.summary().startswith("NOT SHOWN: L does not fall")
-    certification = certify(controller, linear_env, lyapunov, 30, ultimate_bound=0.05, seed=200)
+    certification = certify(controller, linear_env, lyapunov=lyapunov, n_episodes=30, ultimate_bound=0.05, seed=200)
     assert certification.statements.loc["stays_within", "n_true"] == 0
     assert certification.statements.loc["stays_within", "at_least"] == 0
     assert "decreases" not in certification.statements.index and "not made" in certification.summary()
@@ -93,7 +95,7 @@ def test_destabilised_loop_fails(linear_env, optimal, factor):
 
 def test_known_function_is_judged_like_a_learned_one(linear_env, optimal, exact):
     function, _, average_cost = exact
-    report = evaluate_lyapunov(optimal[0], linear_env, 100, seed=0, lyapunov=function)
+    report = evaluate_lyapunov(optimal[0], linear_env, n_episodes=100, seed=0, lyapunov=function)
     assert report.holds and report.alpha3 == 1.0
     # With it both bounds are the mean cost in the long run, of the noise alone: the drift is -(c - average cost)
     assert report.metrics["decrease"].value == pytest.approx(average_cost, rel=0.2)
@@ -101,7 +103,7 @@ def test_known_function_is_judged_like_a_learned_one(linear_env, optimal, exact)
     assert low < 1.1 * average_cost < 1.5 * average_cost and average_cost < high
     # The bounds err on the safe side, with few episodes too
     for seed in (1000, 2000, 3000):
-        metrics = evaluate_lyapunov(optimal[0], linear_env, 20, seed=seed, lyapunov=function).metrics
+        metrics = evaluate_lyapunov(optimal[0], linear_env, n_episodes=20, seed=seed, lyapunov=function).metrics
         assert metrics["residual"].high > average_cost and metrics["cost_bound"].high > average_cost
         assert metrics["cost_bound"].value < 1.5 * average_cost
 
@@ -116,9 +118,96 @@ def test_loop_whose_cost_rises_in_the_end_does_not_hold(optimal, factor, holds):
 
     clock = LyapunovFunction(lambda observations: 200.0 - observations[:, 2])
     env = gym.wrappers.TimeAwareObservation(gym.make("LinearCost-v0"), normalize_time=False)
-    report = evaluate_lyapunov(OfTheState(optimal[0], factor), env, 30, seed=0, lyapunov=clock)
+    report = evaluate_lyapunov(OfTheState(optimal[0], factor), env, n_episodes=30, seed=0, lyapunov=clock)
     assert report.holds == holds and ("rises where the roll-outs end" in report.summary()) != holds
     assert report.metrics["cost_bound"].value >= report.metrics["late_cost"].value
+
+
+class Beside(ScaledController):
+    """A controller that adds the same to each of its actions, and so rests beside its goal."""
+
+    def predict(self, *arguments, **options):
+        actions, state = self.controller.predict(*arguments, **options)
+        return actions + self.factor, state
+
+
+@pytest.fixture(scope="module")
+def beside(optimal, linear_env):
+    controller = Beside(optimal[0], np.float32(0.15))
+    return controller, fit_lyapunov(controller, linear_env, n_episodes=50, seed=0, **FIT)
+
+
+def test_verdict_says_where_a_loop_rests(optimal, beside, linear_env):
+    for (controller, lyapunov), asked in ((optimal, False), (beside, True)):
+        report = evaluate_lyapunov(controller, linear_env, n_episodes=50, seed=100, lyapunov=lyapunov)
+        share = 100 * report.metrics["late_cost"].value / report.metrics["start_cost"].value
+        assert report.holds and (share > 10) == asked
+        assert report.summary().startswith(f"HOLDS, and rests at {share:.3g} % of the start's cost")
+        assert ("beside the goal?" in report.summary()) == asked
+
+
+def test_one_stated_bound_ranks_loops_that_pass_by_their_own(optimal, beside, linear_env):
+    passed = {}
+    for name, (controller, lyapunov) in (("optimal", optimal), ("beside", beside)):
+        for bound in (None, 0.02):
+            report = certify(controller, linear_env, lyapunov=lyapunov, n_episodes=50, ultimate_bound=bound, seed=200)
+            passed[name, bound] = report.statements.loc["stays_within", "share"]
+            assert ("The bound is this loop's own" in report.summary()) == report.own_bound == (bound is None)
+            assert ("beside the goal?" in report.summary()) == (name == "beside")
+            (label,) = (text.get_text() for text in report.plot().axes[1].get_legend().texts if "bound" in text.get_text())
+            assert label.startswith("bound of this loop alone" if bound is None else "stated bound 0.02")
+    assert passed["beside", None] >= 0.9 and passed["optimal", None] >= 0.9
+    assert passed["beside", 0.02] == 0.0 and passed["optimal", 0.02] == 1.0
+
+
+# Verdicts
+
+FALLING, RISING, TOO_WIDE = Interval(0.5, 0.4, 0.6), Interval(-0.5, -0.6, -0.4), Interval(0.25, -0.25, 0.75)
+NONE = Interval(math.nan, math.nan, math.nan)
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason", "enough"),
+    [
+        ({"death_rate": Interval(0.5, 0.1, 0.9)}, Reason.DIED, None),
+        ({"largest_feasible_alpha3": NONE}, Reason.FREE, 200),
+        ({"largest_feasible_alpha3": RISING}, Reason.L_RISES, None),
+        # Half of the interval is twice the value, and with four times as many episodes as wide as that
+        ({"largest_feasible_alpha3": TOO_WIDE}, Reason.L_RISES, 200),
+        ({"largest_feasible_alpha3": Interval(-0.25, -0.75, 0.25)}, Reason.L_RISES, 200),
+        # What is close to the limit is asked again, and no millions of episodes
+        ({"largest_feasible_alpha3": Interval(1e-9, -0.5, 0.5)}, Reason.L_RISES, 400),
+        ({"cost_bound_alpha3": NONE}, Reason.RISES_FAR_OUT, None),
+        ({"late_rise": Interval(9.0, 8.0, 10.0)}, Reason.COST_RISES, None),
+        ({"cost_bound": Interval(20.0, 19.0, 21.0)}, Reason.UNSETTLED, None),
+        # What is decided is said first
+        ({"largest_feasible_alpha3": TOO_WIDE, "cost_bound": Interval(20.0, 19.0, 21.0)}, Reason.UNSETTLED, None),
+    ],
+)
+def test_each_reason_is_said_with_the_episodes_that_it_lacks(optimal, linear_env, changed, reason, enough):
+    controller, lyapunov = optimal
+    report = evaluate_lyapunov(controller, linear_env, n_episodes=50, seed=100, lyapunov=lyapunov)
+    report = dataclasses.replace(report, metrics=report.metrics | changed)
+    first = report.summary().splitlines()[0]
+    assert not report.holds and first.startswith("NOT SHOWN") and reason.value in first
+    assert re.findall(r"50 do not tell, n_episodes=(\d+) may", first) == ([] if enough is None else [str(enough)])
+    assert (SHORT in first) == (enough is not None)
+
+
+def test_verdict_that_holds_says_if_more_episodes_may_show_a_rise(optimal, linear_env):
+    controller, lyapunov = optimal
+    report = evaluate_lyapunov(controller, linear_env, n_episodes=50, seed=100, lyapunov=lyapunov)
+    assert SHORT not in report.summary()
+    report = dataclasses.replace(report, metrics=report.metrics | {"late_rise": Interval(1.0, -0.5, 2.5)})
+    assert report.holds and f"{SHORT}: whether {Reason.COST_RISES.value}, n_episodes=150 may tell" in report.summary()
+
+
+def test_with_the_episodes_that_a_verdict_asks_for_it_is_decided(exact, optimal, linear_env):
+    controller = Beside(optimal[0], np.float32(0.25))
+    few = evaluate_lyapunov(controller, linear_env, n_episodes=20, seed=100, lyapunov=exact[0])
+    (enough,) = re.findall(r"n_episodes=(\d+) may", few.summary())
+    many = evaluate_lyapunov(controller, linear_env, n_episodes=int(enough), seed=100, lyapunov=exact[0])
+    assert not few.holds and SHORT in few.summary() and many.holds and SHORT not in many.summary()
 
 
 # Other roll-outs
@@ -130,7 +219,7 @@ def test_roll_outs_of_a_fit_say_nothing_of_others(optimal, linear_env):
         for seed in (0, 9):
             with pytest.raises(ValueError, match=rf"seed={seed} with 10 environments .* \(seeds 0 to 9\).* from 10 on"):
                 judge(controller, linear_env, lyapunov=lyapunov, seed=seed)
-    evaluate_lyapunov(controller, linear_env, 10, seed=10, lyapunov=lyapunov)
+    evaluate_lyapunov(controller, linear_env, n_episodes=10, seed=10, lyapunov=lyapunov)
 
 
 def sampled(actions):
@@ -146,18 +235,18 @@ def test_roll_outs_without_a_seed_are_new_ones(make_env, env_seed):
     drawn = []
     env = make_vec_env(make_env, n_envs=2, seed=env_seed)
     policy = NoController(lambda zeros: (drawn.append(sampled(zeros)[0]) or drawn[-1], None))
-    lyapunov = fit_lyapunov(policy, env, 2, progress_bar=False)
+    lyapunov = fit_lyapunov(policy, env, n_episodes=2, progress_bar=False)
     with pytest.raises(ValueError, match="the Lyapunov function was fitted on"):
-        certify(policy, env, lyapunov, 2, seed=lyapunov.seeds.start)
+        certify(policy, env, lyapunov=lyapunov, n_episodes=2, seed=lyapunov.seeds.start)
     reports = []
-    for judge, n_episodes in ((certify, "n_episodes"), (certify, "n_episodes"), (evaluate_lyapunov, "n_eval_episodes")):
+    for judge in (certify, certify, evaluate_lyapunov):
         env = make_vec_env(make_env, n_envs=2, seed=env_seed)
-        reports.append(judge(policy, env, lyapunov=lyapunov, **{n_episodes: 2}))
+        reports.append(judge(policy, env, lyapunov=lyapunov, n_episodes=2))
     # Each draws other states and actions
     assert len({report.transitions["reward"].iloc[0] for report in reports}) == 3
     assert len({actions[0, 0] for actions in drawn}) == len(drawn)
     # And can be made again
-    again = evaluate_lyapunov(policy, env, 2, lyapunov=lyapunov, seed=reports[2].seed)
+    again = evaluate_lyapunov(policy, env, n_episodes=2, lyapunov=lyapunov, seed=reports[2].seed)
     assert again.transitions.equals(reports[2].transitions)
 
 
@@ -169,7 +258,7 @@ def test_fit_is_reproducible_and_leaves_random_numbers_alone(linear_env, optimal
         th.manual_seed(1)
         np.random.seed(1)
         random.seed(1)
-        values.append(fit_lyapunov(controller, linear_env, 10, seed=seed, progress_bar=False).values(points))
+        values.append(fit_lyapunov(controller, linear_env, n_episodes=10, seed=seed, progress_bar=False).values(points))
         drawn = (th.rand(1).item(), np.random.rand(), random.random())
         assert drawn == pytest.approx((0.7576315999, 0.417022004702574, 0.13436424411240122))
     np.testing.assert_array_equal(values[0], values[1])
@@ -185,7 +274,7 @@ def test_function_does_not_depend_on_what_never_changed(make_env):
             return np.append(state, np.float32(last if env.n_steps == env.episode_length else 0.1))
 
         space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
-        return fit_lyapunov(policy, gym.wrappers.TransformObservation(env, shown, space), 10, seed=0, **FIT)
+        return fit_lyapunov(policy, gym.wrappers.TransformObservation(env, shown, space), n_episodes=10, seed=0, **FIT)
 
     lyapunov, changed = fit(0.1), fit(1.0)
     points = np.array([[1.0, 0.5, 0.1], [0.0, -1.0, 0.1]])
@@ -226,7 +315,7 @@ def test_cost_that_goes_up_and_down_does_not_rise():
     """As that of a goal that moves: in the last fifth it is higher than in the one before, and not than ever before."""
     costs = [8.0, 8.0, *(1.0 + np.sin(2 * np.pi * np.arange(2, 20) / 10 - 2.5))]
     falls = LyapunovFunction(lambda observations: np.where(observations[:, 0] < 99, observations[:, 0], 0.0))
-    report = evaluate_lyapunov(NoController(), PlannedEnv([costs]), 10, seed=0, lyapunov=falls)
+    report = evaluate_lyapunov(NoController(), PlannedEnv([costs]), n_episodes=10, seed=0, lyapunov=falls)
     fifths = np.reshape(costs, (5, 4)).mean(axis=1)
     assert fifths[4] > fifths[3] + 0.5 and report.metrics["late_cost"].value == pytest.approx(fifths[4])
     assert report.metrics["late_rise"].value == pytest.approx(fifths[4] - fifths[1:4].max())
@@ -311,7 +400,7 @@ FALLS.level, FALLS.window_steps, FALLS.ultimate_bound = 1.8, 1, 1.2
 def test_statements_count_what_they_say(monkeypatch):
     settles, rises, stays, dies, rests = [8, 4, 2, 1, 1], [8, 4, 9, 1, 1], [8, 4, 2, 1.5, 1.5], [8, 4, np.inf], [1, 1, 1, 1, 1]
     env = PlannedEnv([settles, rises, stays, dies, rests])
-    report = certify(NoController(), env, FALLS, 10, seed=0)
+    report = certify(NoController(), env, lyapunov=FALLS, n_episodes=10, seed=0)
     frame = report.statements
     assert frame["n_episodes"].to_dict() == {"survives": 10, "stays_within": 10, "decreases": 8}
     # The late costs are those of the last step; what rests never starts above the level and does not testify
@@ -327,7 +416,7 @@ def test_statements_count_what_they_say(monkeypatch):
     assert "0.9999 " in dataclasses.replace(report, statements=frame.assign(at_least=0.99998)).summary()
     # A wider window passes over the rise
     monkeypatch.setattr(FALLS, "window_steps", 3)
-    assert certify(NoController(), env, FALLS, 5).statements.loc["decreases", "n_true"] == 3
+    assert certify(NoController(), env, lyapunov=FALLS, n_episodes=5).statements.loc["decreases", "n_true"] == 3
 
 
 def test_region_of_attraction_on_a_grid():
@@ -361,14 +450,14 @@ def test_a_cost_of_the_bound_is_within_the_bound():
 def test_death_is_no_decrease():
     """Transitions into terminal states have no next value: they count as deaths, and in nothing else."""
     env = PlannedEnv([[8, 4, np.inf], [8, 4, 2, 1]])
-    report = evaluate_lyapunov(NoController(), env, 10, lyapunov=IDENTITY, seed=0)
+    report = evaluate_lyapunov(NoController(), env, n_episodes=10, lyapunov=IDENTITY, seed=0)
     known = report.transitions[~report.transitions["terminated"]]
     assert report.transitions["next_lyapunov"].isna().sum() == report.transitions["terminated"].sum() == 5
     assert report.metrics["decrease"].value == pytest.approx(known["difference"].mean())
-    assert not report.holds and "5 of 10 episodes died" in report.summary()
+    assert not report.holds and "episodes died (5 of 10)" in report.summary()
     # Some samples of these episodes have no transition at all
     env = PlannedEnv([[5, np.inf]] * 9 + [[8, 4, 2, 1]])
-    report = evaluate_lyapunov(NoController(), env, 10, lyapunov=IDENTITY, seed=0)
+    report = evaluate_lyapunov(NoController(), env, n_episodes=10, lyapunov=IDENTITY, seed=0)
     assert report.metrics["death_rate"].value == 0.9 and not report.holds
     assert np.isfinite(report.metrics["cost_bound"].value)
 
@@ -378,7 +467,7 @@ def test_states_that_die_have_a_large_value(monkeypatch):
     monkeypatch.setattr(fitting, "BATCH_SIZE", 64)
     # The same first cost; the one dies of it, the other settles
     env = PlannedEnv([[3, 50, np.inf], [4, 2, 1, 1, 1, 1, 1, 1]])
-    lyapunov = fit_lyapunov(NoController(), env, 60, seed=0, progress_bar=False)
+    lyapunov = fit_lyapunov(NoController(), env, n_episodes=60, seed=0, progress_bar=False)
     dying, settling = lyapunov.values(np.array([[3.0], [4.0]]))
     assert dying > 3 * settling
 
@@ -427,7 +516,7 @@ def test_critic_is_a_function_of_the_observation(make_model, make_env):
     observations = np.random.default_rng(0).normal(size=(5, 2)).astype(np.float32)
     actions, _ = model.predict(observations, deterministic=True)
     np.testing.assert_array_equal(lyapunov.values(observations), model.policy.predict_lyapunov(observations, actions))
-    assert "lyapunov" in certify(model, make_env(), lyapunov, 3, ultimate_bound=1.0, seed=10).transitions
+    assert "lyapunov" in certify(model, make_env(), lyapunov=lyapunov, n_episodes=3, ultimate_bound=1.0, seed=10).transitions
 
 
 def test_costs_of_other_functions_are_those_of_the_env(make_env):
@@ -435,8 +524,8 @@ def test_costs_of_other_functions_are_those_of_the_env(make_env):
     model = SAC("MlpPolicy", env, buffer_size=100, learning_starts=1000, policy_kwargs={"net_arch": [8]}, seed=0)
     model.learn(100)
     eval_env.obs_rms, eval_env.ret_rms = env.obs_rms, env.ret_rms
-    lyapunov = fit_lyapunov(model, eval_env, 4, seed=2, progress_bar=False)
-    report = evaluate_lyapunov(model, eval_env, 4, seed=10, lyapunov=lyapunov)
+    lyapunov = fit_lyapunov(model, eval_env, n_episodes=4, seed=2, progress_bar=False)
+    report = evaluate_lyapunov(model, eval_env, n_episodes=4, seed=10, lyapunov=lyapunov)
     states = eval_env.unnormalize_obs(report.observations)
     np.testing.assert_allclose(report.transitions["cost"], np.sum(states**2, axis=1), rtol=1e-3, atol=1e-4)
 
@@ -447,7 +536,7 @@ def test_costs_of_other_functions_are_those_of_the_env(make_env):
 @pytest.mark.filterwarnings("ignore:Observations lie far")
 def test_callback_logs_the_certificates_of_any_algorithm(make_env):
     model = SAC("MlpPolicy", make_env(), learning_starts=100, policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=0)
-    callback = CertificateCallback(make_env(), n_eval_episodes=4, eval_freq=10, verbose=0)
+    callback = CertificateCallback(make_env(), n_episodes=4, eval_freq=10, verbose=0)
     model.learn(20, callback=callback)
     report, certification = callback.last_report, callback.last_certification
     assert len(callback.history) == 2
@@ -459,12 +548,46 @@ def test_callback_logs_the_certificates_of_any_algorithm(make_env):
 def test_callback_goes_on_where_nothing_has_a_cost(make_env, capsys):
     model = SAC("MlpPolicy", make_env(), learning_starts=100, policy_kwargs={"net_arch": [8]}, buffer_size=100, seed=0)
     free = gym.wrappers.TransformReward(make_env(), lambda reward: 0.5)
-    callback = CertificateCallback(free, n_eval_episodes=2, eval_freq=10)
+    callback = CertificateCallback(free, n_episodes=2, eval_freq=10)
     assert model.learn(20, callback=callback).num_timesteps == 20
     assert capsys.readouterr().out.count("nothing had a cost") == 2
     assert callback.last_report is None and callback.last_certification is None
     assert callback.best_mean_reward == 10.0  # of 20 steps
     assert all(np.isnan(value) for name, value in callback.history[0].items() if name != "timesteps")
+
+
+# Arguments
+
+
+def test_arguments_of_before_work_and_say_what_to_write(make_env):
+    def costs(judge, *arguments, **options):
+        return judge(NoController(), PlannedEnv([[4, 2, 1], [8, 2, 1]]), *arguments, **options).transitions["cost"].tolist()
+
+    for judge, old, old_names, new, written in (
+        (certify, (FALLS, 2), {}, {"lyapunov": FALLS, "n_episodes": 2}, "lyapunov=..., n_episodes=..."),
+        (evaluate_lyapunov, (2, True, 7, FALLS), {}, {"n_episodes": 2, "seed": 7, "lyapunov": FALLS}, "lyapunov=..."),
+        (
+            evaluate_lyapunov,
+            (),
+            {"n_eval_episodes": 2, "lyapunov": FALLS},
+            {"n_episodes": 2, "lyapunov": FALLS},
+            "n_episodes=...",
+        ),
+    ):
+        with pytest.warns(DeprecationWarning, match=re.escape(written)):
+            before = costs(judge, *old, **old_names)
+        assert before == costs(judge, **new)
+    with pytest.warns(DeprecationWarning, match="fit_lyapunov: write n_episodes=..., deterministic=..., seed=..."):
+        before = fit_lyapunov(NoController(), PlannedEnv([[4, 2, 1]]), 3, True, 0, progress_bar=False)
+    now = fit_lyapunov(NoController(), PlannedEnv([[4, 2, 1]]), n_episodes=3, seed=0, progress_bar=False)
+    assert before.values(np.ones((1, 1))) == now.values(np.ones((1, 1)))
+    for make in (LyapunovCallback, CertificateCallback):
+        with pytest.warns(DeprecationWarning, match="write n_episodes=..."):
+            assert make(make_env(), n_eval_episodes=4).n_episodes == 4
+    with pytest.warns(DeprecationWarning), pytest.raises(TypeError, match="takes 2 positional arguments"):
+        fit_lyapunov(NoController(), ONES, 3, True, 0, False, "one too many")
+    with pytest.warns(DeprecationWarning), pytest.raises(TypeError, match="multiple values for keyword argument 'n_episodes'"):
+        certify(NoController(), ONES, None, 3, n_episodes=4)
 
 
 # Refusals
@@ -545,14 +668,14 @@ def test_functions_that_cannot_be_are_refused(make, message):
 def test_fit_that_diverges_is_refused(linear_env, optimal, monkeypatch):
     monkeypatch.setattr(fitting, "LEARNING_RATE", 1e30)
     with pytest.raises(ValueError, match="The fit diverged"):
-        fit_lyapunov(optimal[0], linear_env, 5, **FIT)
+        fit_lyapunov(optimal[0], linear_env, n_episodes=5, **FIT)
 
 
 @pytest.mark.parametrize(
     ("make", "arguments", "message"),
     [
         (CertificateCallback, {"seed": -1}, "seed=-1 must be a whole number of at least 0"),
-        (CertificateCallback, {"n_eval_episodes": -1}, "and not -1"),
+        (CertificateCallback, {"n_episodes": -1}, "and not -1"),
         (CertificateCallback, {"ultimate_bound": "small"}, "ultimate_bound='small' must be a number"),
         (LyapunovCallback, {}, "must be a LAC or PublishedLAC.*CertificateCallback"),
     ],

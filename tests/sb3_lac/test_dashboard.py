@@ -40,10 +40,10 @@ def runs(tmp_path_factory):
         callbacks = [
             EvalCallback(make_env(), n_eval_episodes=1, eval_freq=12, verbose=0),
             DashboardCallback(CALIBRATION, {"env": "LinearCost-v0", "own": [1, 2]}),
-            CertificateCallback(make_env(), n_eval_episodes=2, eval_freq=24, verbose=0),
+            CertificateCallback(make_env(), n_episodes=2, eval_freq=24, verbose=0),
         ]
         if algorithm is LAC:
-            callbacks.append(LyapunovCallback(make_env(), n_eval_episodes=2, eval_freq=24, verbose=0))
+            callbacks.append(LyapunovCallback(make_env(), n_episodes=2, eval_freq=24, verbose=0))
         model.learn(24, callback=callbacks, log_interval=1)
         model.logger.close()
     return {name: EventAccumulator(str(folder / f"{name}_1")).Reload() for name in ("LAC", "SAC", "TD3")}

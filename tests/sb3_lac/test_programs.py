@@ -250,7 +250,7 @@ def test_a_time_limit_that_is_returned_as_a_termination_is_named_in_certificate_
     for lengths, is_limit in (((20, 20), True), ((20, 15), False)):
         each = iter(lengths)
         env = make_vec_env(lambda each=each: make_env(episode_length=next(each), terminate=True), 2)
-        report = evaluate_lyapunov(Controller(), env, 4, seed=0, lyapunov=lyapunov)
+        report = evaluate_lyapunov(Controller(), env, n_episodes=4, seed=0, lyapunov=lyapunov)
         for text in (report.summary(), certify(Controller(), env, n_episodes=4, seed=0, ultimate_bound=9.0).summary()):
             assert ("(4) have 20 steps, as with a time limit. If it is one, return truncated=True" in text) == is_limit
     env = make_vec_env(make_env, 1)
@@ -265,7 +265,7 @@ def test_a_controller_without_deterministic_is_told_how(make_env):
     with pytest.raises(
         ValueError, match=r"predict\(\) of Controller must take deterministic.* def predict\(self, observation, det"
     ):
-        fit_lyapunov(Controller(), make_env(), 4)
+        fit_lyapunov(Controller(), make_env(), n_episodes=4)
 
 
 class Tensors(gym.vector.VectorEnv):

@@ -18,7 +18,7 @@ def predictions(model, buffer=None):
 
 def test_report_counts_the_bound_after_a_termination(make_model, make_env):
     model = make_model(make_env(), n_collect=0, gamma=0.5, reward_bound=2.0)
-    report = evaluate_lyapunov(model, make_env(episode_length=3, terminate=True, offset=1.0), 2, seed=1)
+    report = evaluate_lyapunov(model, make_env(episode_length=3, terminate=True, offset=1.0), n_episodes=2, seed=1)
     costs = report.transitions["cost"].to_numpy().reshape(2, 3)
     np.testing.assert_allclose(costs, 2.0 - report.transitions["reward"].to_numpy().reshape(2, 3))
     last = costs[:, 2] + 0.5 * 4.0
@@ -87,7 +87,7 @@ def test_report_does_not_change_the_critic(make_model, make_env, train_metrics):
     state = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
     eval_env = VecNormalize(DummyVecEnv([lambda: make_env(offset=3.0)]), gamma=0.75)
     eval_env.ret_rms.var = 4.0 - eval_env.epsilon
-    report = evaluate_lyapunov(model, eval_env, 2, seed=1)
+    report = evaluate_lyapunov(model, eval_env, n_episodes=2, seed=1)
     assert all(th.equal(state[name], tensor) for name, tensor in model.policy.state_dict().items())
     # Its values have the units of its rewards: with an offset of 4 * 3 / 2
     actions, _ = model.predict(report.observations, deterministic=True)
@@ -108,5 +108,5 @@ def test_without_discount_a_positive_reward_makes_values_infinite_and_ends_no_tr
     assert not any(th.equal(*pair) for pair in zip(before, model.actor.parameters(), strict=True))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        report = evaluate_lyapunov(model, make_env(offset=4.0), 4, seed=1)
+        report = evaluate_lyapunov(model, make_env(offset=4.0), n_episodes=4, seed=1)
     assert "L is not finite" in report.summary() and not report.holds

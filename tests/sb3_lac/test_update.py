@@ -266,7 +266,7 @@ def test_no_gradient_step_changes_nothing(make_model, train_metrics):
 )
 def test_it_learns_to_control(make_model, make_env, algorithm, kwargs):
     def mean_cost():
-        return evaluate_lyapunov(model, make_env(n_dim=1), 10, seed=1000).metrics["mean_cost"].value
+        return evaluate_lyapunov(model, make_env(n_dim=1), n_episodes=10, seed=1000).metrics["mean_cost"].value
 
     options = {"learning_rate": 1e-2, "gamma": 0.9, "tau": 0.05, **kwargs}
     model = make_model(make_env(n_dim=1), n_collect=0, algorithm=algorithm, **options)
