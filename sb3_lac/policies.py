@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
+
 def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
     """The conservative one of several critics."""
     return reduce(th.maximum, values)

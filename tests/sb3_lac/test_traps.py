@@ -126,7 +126,11 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
 
     # All weights and biases of actor and critic are parameters, have an optimizer and change
     for module in (model.actor, model.critic):
-        assert {name for name, _ in module.named_parameters()} == set(module.state_dict()) - {"offset", "floor", "_extra_state"}
+        assert {name for name, _ in module.named_parameters()} == set(module.state_dict()) - {
+            "offset",
+            "floor",
+            "_extra_state",
+        }
         optimized = [parameter for group in module.optimizer.param_groups for parameter in group["params"]]
         assert {id(parameter) for parameter in optimized} == {id(parameter) for parameter in module.parameters()}
     before = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
