@@ -19,7 +19,7 @@ logged = ($(1)) > $(VENV)/install.log 2>&1 || { cat $(VENV)/install.log >&2; exi
 comma := ,
 $(VENV)/.installed: EXTRAS := zoo$(comma)peers$(comma)onnx$(comma)dev$(comma)docs
 # what the demo needs; after make install it needs nothing more
-$(VENV)/.demo: EXTRAS := zoo$(comma)demo
+$(VENV)/.demo: EXTRAS := zoo
 # without the RL Zoo, which needs a newer Stable-Baselines3
 OLDEST_EXTRAS := peers$(comma)onnx$(comma)dev$(comma)docs
 
