@@ -30,6 +30,7 @@ _HANDING_ON = (
     *(
         "gymnasium.core.Wrapper.",
         "gymnasium.core.RewardWrapper.",
+        "rl_zoo3.gym_patches.",  # of the time limit
         "sb3_lac.envs.randomisation.",
         "stable_baselines3.common.monitor.",
     ),

@@ -6,12 +6,12 @@ import shlex
 import numpy as np
 import pytest
 from PIL import Image
-from sb3_lac.costs import advice_for_a_time_limit
 
 from battery_env.__main__ import calibrate
 from battery_env.estimators.reasons import Doubt, Reason
 from battery_env.parameters import PARAMETER_NAMES
 from checks.pages import DOCS, PAGES, ROOT, blocks, docstring_examples
+from sb3_lac.checks import advice_for_a_time_limit
 from sb3_lac.stability import NoCostError, fitting, report
 from sb3_lac.stability.certification import NEEDS, OWN_BOUND
 from sb3_lac.stability.rollout import where_it_rests
