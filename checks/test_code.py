@@ -187,9 +187,12 @@ def test_no_private_name_leaves_its_module():
 #: What there was at the last release. Until the next one, which writes its own numbers here, there may be a share of AIR more.
 AT_RELEASE = {
     "battery_env": {"lines": 18_328, "numbers at the top of modules": 192, "starred calls": 44},
-    "sb3_lac": {"lines": 6_892, "numbers at the top of modules": 21, "starred calls": 39},
+    # for who puts a policy of a wrapped environment onto a plant, who clips gradients by hooks in compiled trainings, whose
+    # instrument is out of its range, and who compares two loops: each met a silent wrong
+    "sb3_lac": {"lines": 7_391, "numbers at the top of modules": 21, "starred calls": 39},
     "benchmarks": {"lines": 6_202},
-    "tests": {"lines": 16_773},
+    # the programs of these users, and inputs that were right once
+    "tests": {"lines": 17_790},
     "checks": {"lines": 819},
 }
 AIR = 0.03
