@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.polynomial import Polynomial
+from numpy.polynomial.polynomial import polyfit
 
 from battery_env.arrays import FloatArray
-from battery_env.records import CUT_OFF_V, SWITCH_SHARE, Samples, drawn
+from battery_env.records import CUT_OFF_V, SWITCH_SHARE, Samples, drawn, is_load
 
 # The end of a record: this share of the charge that was drawn, and at least so many samples.
 _END_SHARE, _LEAST_SAMPLES = 0.05, 5
@@ -23,7 +23,7 @@ def knee_sd_C(record: Samples, model_V: FloatArray, empty_V: float) -> float:
     :param empty_V: voltage of an empty cell, V; 2.7 V if that is lower
     """
     drawn_C = drawn(record.time_s, record.current_A, record.time_s)
-    load_A = record.current_A[np.flatnonzero(record.current_A)[-1]]
+    load_A = record.current_A[np.flatnonzero(is_load(record.current_A))[-1]]
     # voltages are compared under the load of the end
     is_end = np.isfinite(model_V) & (np.abs(record.current_A - load_A) < SWITCH_SHARE * abs(load_A))
     samples = np.flatnonzero(is_end)
@@ -39,7 +39,8 @@ def knee_sd_C(record: Samples, model_V: FloatArray, empty_V: float) -> float:
 
 def _charge_to_fall_C(charge_C: FloatArray, voltage_V: FloatArray, fall_V: float) -> float:
     """The charge until a voltage has fallen, if slope and bend at the end stay as they are; one that bends up is straight."""
-    _, slope, bend = Polynomial.fit(charge_C, voltage_V, 2).convert().coef
-    slope, bend = max(-slope, 0.0), max(-bend, 0.0)
-    root = np.sqrt(slope**2 + 4.0 * bend * fall_V)
-    return float(2.0 * fall_V / (slope + root)) if root > 0.0 else np.inf
+    span_C = -charge_C[0]
+    _, slope_V, bend_V = polyfit(charge_C / span_C, voltage_V, 2)
+    slope_V, bend_V = max(-slope_V, 0.0), max(-bend_V, 0.0)
+    root_V = np.sqrt(slope_V**2 + 4.0 * bend_V * fall_V)
+    return float(2.0 * fall_V * span_C / (slope_V + root_V)) if root_V > 0.0 else np.inf
