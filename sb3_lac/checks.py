@@ -76,7 +76,7 @@ def refuse_what_spoils_weights(name: str, value: Any, step: int, vec_normalize: 
     if vec_normalize is not None and vec_normalize.training and getattr(vec_normalize, normalized):
         remedy += " The statistics of VecNormalize have it already: begin with new ones, or with those of an earlier file."
     raise ValueError(
-        f"The {name} {numbers[~sound].ravel()[0]} at step {step}: all must be finite, and within +-1.8e19, whose square "
+        f"The {name} {numbers[~sound].ravel()[0]!s} at step {step}: all must be finite, and within +-1.8e19, whose square "
         f"float32 holds. {remedy}"
     )
 
