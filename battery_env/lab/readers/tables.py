@@ -244,7 +244,8 @@ def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: Fil
         # a delimiter may end each
         widths = np.array([(len(row), len(_filled(row))) for row in rows]).reshape(-1, 2)
         if (count := int(counts[are_numbers].sum())) > most:
-            most, first, of_most = count, int(are_numbers.argmax()), key
+            usual = np.bincount(widths[are_numbers, 1]).argmax()  # a title may hold numbers, too
+            most, first, of_most = count, int((are_numbers & (widths[:, 1] == usual)).argmax()), key
         for n, row in enumerate(rows[:_HEAD_LINES]):
             if any(row) and not counts[n]:
                 below, quantities = slice(n + 1, n + 1 + _FIRST_ROWS), count_required(row, file_format)
