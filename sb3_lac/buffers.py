@@ -15,8 +15,8 @@ _CHUNK_BYTES = 64 * 2**20
 
 class Samples(NamedTuple):
     """
-    What an update needs to know of transitions: samples of Stable-Baselines3 and, with a horizon, the undiscounted sums of the
-    rewards from them on.
+    Sampled transitions for an update: samples of Stable-Baselines3 and, with a horizon, the undiscounted sums of the rewards
+    from each transition on.
     """
 
     observations: th.Tensor | TensorDict

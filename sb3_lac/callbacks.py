@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 class LyapunovCallback(EventCallback):
     """
-    Callback for evaluating the learned Lyapunov function along roll-outs of the mean action (see ``evaluate_lyapunov()``).
-    The training is not changed by it. TensorBoard also gets the figure of each report, CSV and JSON the limits of intervals.
+    Callback for evaluating LAC's learned Lyapunov function along roll-outs of the mean action (see ``evaluate_lyapunov()``),
+    without an effect on the training. TensorBoard also gets the figure of each report, CSV and JSON the limits of intervals.
 
     .. warning::
 
@@ -46,9 +46,9 @@ class LyapunovCallback(EventCallback):
         ``self.parent.best_mean_reward``, the largest mean return of an evaluation (of the rewards in the report).
     :param n_episodes: Number of episodes of an evaluation
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
-    :param seed: Seed of each evaluation, so that all of them have the same start states; if it is None, each draws its own
+    :param seed: Seed of each evaluation, for the same initial states in all evaluations; if None, each evaluation draws a seed
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
-    :ivar history: What was logged of each evaluation of the training, with all intervals
+    :ivar history: The logged values of each evaluation of the training, with all intervals
     """
 
     #: Before the names of what is logged
@@ -146,12 +146,11 @@ class LyapunovCallback(EventCallback):
 
 class CertificateCallback(LyapunovCallback):
     """
-    Callback for certifying the policy of any algorithm while it trains: a Lyapunov function is fitted to roll-outs of the mean
-    action (see ``fit_lyapunov()``), exact statements are made about others (see ``certify()``), and the function is judged on
-    yet others (see ``evaluate_lyapunov()``). The training is not changed by it. Each of the three takes its own seed, so that
-    all evaluations have the same start states and none is judged on what it was fitted on. Where nothing has a cost there is
-    nothing to certify: all values are then NaN. TensorBoard also gets two figures, ``certificate/drift`` and
-    ``certificate/statements``.
+    Callback for certifying the policy of any algorithm during the training, without an effect on the training. Each evaluation
+    fits a Lyapunov function to roll-outs of the mean action (``fit_lyapunov()``), and judges it on new roll-outs
+    (``certify()``, ``evaluate_lyapunov()``). Each of the three functions has its own seed, so that all evaluations have the
+    same initial states, and no function is judged on its own fit. Without any cost all values are NaN. TensorBoard also gets
+    two figures, ``certificate/drift`` and ``certificate/statements``.
 
     :param eval_env: The environment used for evaluation, as for ``LyapunovCallback``
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the reports in
@@ -159,7 +158,7 @@ class CertificateCallback(LyapunovCallback):
     :param n_episodes: Number of episodes for each of the three
     :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param ultimate_bound: The cost to stay within, the largest late cost of the roll-outs of the fit by default
-    :param seed: Seed of each evaluation, far from those of the training; if it is None, each draws its own
+    :param seed: Seed of each evaluation, far from those of the training; if None, each evaluation draws a seed
     :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
 

@@ -97,22 +97,21 @@ class _LogarithmOfCosts(KVWriter):
 
 class DashboardCallback(BaseCallback):
     """
-    Callback that makes TensorBoard show this run and others of the same folder as one comparison. The training is not changed
-    by it. It writes
+    Callback that makes TensorBoard show all runs of a folder as one comparison, without an effect on the training. It writes
 
     - the layout of the Custom Scalars tab: one chart per quantity, with all runs in it
-    - the hyperparameters for the HParams tab, where they stand beside the last value of each scalar of the run
-    - ``rollout/cost_mean``, the mean of ``info["cost"]`` over the steps since the last entry, if the environment has costs;
-      what is no finite number does not count
-    - ``eval/cost_log10``, the logarithm of what an episode of ``EvalCallback`` costs, which is minus its return
+    - the hyperparameters for the HParams tab, next to the last value of each scalar of the run
+    - ``rollout/cost_mean``, the mean of finite ``info["cost"]`` over the steps since the last entry, if the environment has
+      costs
+    - ``eval/cost_log10``, the logarithm of the cost (minus the return) of an episode of ``EvalCallback``
 
-    Evaluations are left to ``EvalCallback`` (``eval/``), ``LyapunovCallback`` (``lyapunov/``, of LAC's critic) and
+    For evaluations use ``EvalCallback`` (``eval/``), ``LyapunovCallback`` (``lyapunov/``, of LAC's critic) and
     ``CertificateCallback`` (``certificate/``, of any algorithm).
 
-    :param charts: More charts, like ``battery_env.callbacks.CALIBRATION_CHARTS``. They come first. All runs should have
-        the same.
-    :param hparams: More hyperparameters, like the id of the environment. They have precedence over those of the model.
-        Values that are neither numbers nor texts are written as text.
+    :param charts: More charts, like ``battery_env.callbacks.CALIBRATION_CHARTS``, shown first. All runs should have the same
+        charts.
+    :param hparams: More hyperparameters, like the id of the environment, with precedence over those of the model. Values other
+        than numbers are written as text.
     :param verbose: Verbosity level, without a meaning here
     """
 

@@ -16,15 +16,15 @@ from sb3_lac.updates import Metrics, backward
 
 class LAC(CostAlgorithm):
     """
-    Lyapunov Actor-Critic (LAC), a soft actor-critic for tasks with a cost
+    Lyapunov Actor-Critic (LAC), a soft actor-critic that minimises a cost
     Actor-Critic Reinforcement Learning for Control with Stability Guarantee,
     This implementation uses the SB3 SAC implementation as base.
     Paper: https://arxiv.org/abs/2004.14288
 
-    It changes the published algorithm, which is ``PublishedLAC``. Two critics learn the square root of what ``L`` is above its
-    lowest value, in which small costs count beside large ones; the published one learns ``L`` itself, as a sum of squares. The
-    actor lowers that root in the sampled states; the published one lowers the condition on ``L``, in the next states. Targets
-    have the mean action of the actor; the published ones sampled actions of a target actor.
+    LAC differs from the published algorithm, ``PublishedLAC``. Two critics learn the square root of the difference between
+    ``L`` and its lowest value, so that small costs count next to large costs; the published critic learns ``L`` itself, as a
+    sum of squares. The actor minimises this root in the sampled states; the published actor minimises the condition on ``L``
+    in the next states. Targets use the mean action of the actor; published targets use sampled actions of a target actor.
 
     .. code-block:: python
 
@@ -34,15 +34,15 @@ class LAC(CostAlgorithm):
       model.learn(20_000)
       model.save("lac_cart_pole")
 
-    Pay costs as they are, ``reward = -cost``, and let a failure have its price. Choose the discount, the learning rate and the
-    number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. Rare events that cost a lot are
-    underrated: take SAC. Where a loop has to settle near its goal on a known plant, try ``policy_kwargs=dict(root=4)``.
+    Give costs as they are, ``reward = -cost``, and give a failure its price. Choose the discount, the learning rate and the
+    number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. LAC underestimates rare, large
+    costs: use SAC. If a loop has to settle near its goal on a known plant, try ``policy_kwargs=dict(root=4)``.
 
-    The critic ``L(s, a) >= 0`` is the discounted sum of costs. It has to decrease by ``alpha3`` times the cost in each step: a
-    Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up as in SAC.
+    The critic ``L(s, a) >= 0`` is the discounted sum of costs. ``L`` has to decrease by ``alpha3`` times the cost in each
+    step. The Lagrange multiplier ``lambda`` weighs this condition, and ``ent_coef`` keeps the entropy up as in SAC.
 
-    Note: the cost is ``bound - reward``, where ``bound`` is the largest reward (stated or seen, at least 0). A termination
-    pays 0 for ever after, and so costs ``bound`` per step where rewards are positive.
+    Note: the cost is ``bound - reward`` with the largest reward as ``bound`` (stated or seen, at least 0). After a termination
+    all future rewards are 0, so that with positive rewards it costs ``bound`` per step.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -53,8 +53,8 @@ class LAC(CostAlgorithm):
     :param learning_starts: how many steps of the model to collect transitions for before learning starts
     :param batch_size: Minibatch size for each gradient update
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
-    :param gamma: the discount factor. 'auto' is the one that the environment states as ``metadata["discount"]``,
-        or 0.99 if it states none
+    :param gamma: the discount factor. 'auto' takes ``metadata["discount"]`` of the environment, or 0.99 if the environment
+        states no discount
     :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
         like ``(5, "step")`` or ``(2, "episode")``.
     :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
@@ -85,12 +85,12 @@ class LAC(CostAlgorithm):
         If ``None``, it is ``learning_rate``.
     :param reward_bound: Largest reward that the environment can pay (before ``VecNormalize``), at least 0. If a larger
         reward is seen, or if ``None``, it is the largest one seen. ``gamma`` must be below 1 with a bound above 0.
-    :param compile_update: Whether to compile each update to one graph (``torch.compile``), on a GPU a CUDA graph. It
-        needs torch 2.11, and takes minutes at the first update and when a constant like ``batch_size`` has changed.
-        Where there are hooks, an optimizer with a ``step()`` of its own, or a torch that was not tried (above 2.13), updates
-        are as without it, and a warning says so.
+    :param compile_update: Whether to compile each update to one graph (``torch.compile``), on a GPU a CUDA graph. Compiling
+        needs torch 2.11, and takes minutes at the first update and after a change of a constant like ``batch_size``. With
+        hooks, an optimizer with its own ``step()``, or an untested torch (above 2.13), LAC does not compile updates, and
+        warns.
     :param check_observations: Whether to refuse an observation that is not finite, or beyond 1.8e19. ``False`` is for a
-        features extractor that handles such numbers: NaN as a reading that is missing, inf as nothing in range.
+        features extractor that handles such numbers: NaN as a missing reading, inf as nothing in range.
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
         instead of action noise exploration (default: False)
     :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE

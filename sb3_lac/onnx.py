@@ -116,23 +116,23 @@ def export_onnx(
       model = LAC("MlpPolicy", "LinearCost-v0").learn(5_000)
       export_onnx(model, "policy.onnx")
 
-    Its input is ``observation`` and its output ``action``, both float32. The normalization of the observations by
-    ``VecNormalize`` and the scaling of the actions are included. Images are those of the policy, with the channels first. What
-    another wrapper does to observations and actions is left out. A warning and the metadata name it, input and output are then
-    ``observation_of_NormalizeObservation`` or ``action_of_RescaleAction``, and no environment is named. The file is checked
-    with onnxruntime before it takes its name, and ends with its checksum, which ``OnnxPolicy`` of battery_env compares. Needs
-    the extra ``sb3_lac[onnx]``.
+    The input is ``observation`` and the output ``action``, both float32. The file includes the normalization of the
+    observations by ``VecNormalize`` and the scaling of the actions. Images are those of the policy, with the channels first.
+    The file does not include other wrappers of observations and actions. A warning and the metadata name these wrappers; input
+    and output are then ``observation_of_NormalizeObservation`` or ``action_of_RescaleAction``, and the file names no
+    environment. onnxruntime checks the file before it takes its name. The file ends with a checksum for ``OnnxPolicy`` of
+    battery_env. Needs the extra ``sb3_lac[onnx]``.
 
     :param model: LAC, SAC, TD3, TQC, PPO, ... or a policy; or several models, of several seeds: the file has the mean of their
         actions
-    :param path: Of the file; ``.onnx`` is added where it is missing. A file that this function wrote before is replaced.
+    :param path: Path of the file; a missing ``.onnx`` is added. An earlier file of this function is replaced.
     :param env_id: Id of the environment that the policy is for, kept in the file; by default that of the model's environment,
         where it is known
-    :param vec_normalize: What normalizes the observations; by default the wrapper of the model's environment, if it has one. A
-        warning says so where there is no environment, as in a policy or in a model that was loaded without one.
+    :param vec_normalize: Normalization of the observations; by default the wrapper of the model's environment, if any. Without
+        an environment, as for a policy or a model loaded without one, a warning says so.
     :return: Path of the file
-    :raises ValueError: If its spaces are not ``Box``, if it has a memory, if the file does not do what the policy does or
-        takes one number of observations alone, or for models of several spaces
+    :raises ValueError: If the spaces are not ``Box``, if the policy is recurrent, if the file differs from the policy or takes
+        only one batch size, or for models of several spaces
     :raises FileExistsError: If there is another file
     :raises ImportError: Without the extra
     """

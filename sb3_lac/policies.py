@@ -30,8 +30,8 @@ def signed_power(values: th.Tensor, exponent: int) -> th.Tensor:
 
 class LyapunovCritic(BaseModel):
     """
-    Lyapunov critic network(s): each maps state and action to a value ``L(s, a) >= 0``, the cost to come. What a network learns
-    of it is up to the subclasses.
+    Lyapunov critic network(s): each maps state and action to a value ``L(s, a) >= 0``, the discounted cost. Subclasses define
+    the output of a network, for example a root of ``L``.
 
     :param observation_space: Observation space
     :param action_space: Action space
@@ -138,16 +138,16 @@ class LyapunovCritic(BaseModel):
 
 class RootCritic(LyapunovCritic):
     """
-    Lyapunov critic of ``LAC``: each network learns a root ``f(s, a)`` of what ``L`` is above its floor, about the value of the
-    loop at rest: ``L = offset + floor + sign(f) |f|^root``.
+    Lyapunov critic of ``LAC``: each network learns a root ``f(s, a)`` of the difference between ``L`` and its floor, about the
+    value of the settled loop: ``L = offset + floor + sign(f) |f|^root``.
 
-    Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` is a thousand times larger at a
-    thousand times the cost, and one of a square root 32 times, of a fourth root less than six times. The unit of the costs is
-    nothing but a factor of ``f``. With noise ``L`` is biased low: the root of a mean is larger than the mean of the roots.
+    Costs of a settling loop fall over orders of magnitude. At a thousand times the cost, the same relative error is a thousand
+    times larger in ``L``, 32 times in the square root, and less than six times in the fourth root. The unit of the costs is
+    only a factor of ``f``. Noise biases ``L`` low, because the root of a mean is larger than the mean of the roots.
 
-    The floor follows the lowest value. What all values have in common falls slowly while the loop gets better, if the discount
-    is near 1: a root from zero on would be flat just where the loop comes to rest. What is learned is a relative value, as in
-    relative value iteration. The signed root is that of https://arxiv.org/abs/1805.11593, without its linear part.
+    The floor follows the lowest value. If the discount is near 1, the offset of all values falls slowly while the loop
+    improves, and a root without a floor would be flat where the loop rests. The critic learns a relative value, as in relative
+    value iteration. The signed root is from https://arxiv.org/abs/1805.11593, without its linear part.
     """
 
     n_outputs = 1
@@ -208,7 +208,7 @@ class RootCritic(LyapunovCritic):
 
 class LyapunovPolicy(SACPolicy):
     """
-    Policy class (with both actor and critic) for LAC: SAC's, with a ``RootCritic``. ``MlpPolicy`` is another name of it.
+    Policy class (with both actor and critic) for LAC: SAC's with a ``RootCritic``. ``MlpPolicy`` is an alias.
     ``LAC(policy_kwargs=...)`` takes the arguments from ``net_arch`` on:
 
     .. code-block:: python
@@ -221,8 +221,8 @@ class LyapunovPolicy(SACPolicy):
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule (could be constant)
     :param net_arch: The specification of the policy and Lyapunov networks.
-    :param root: Which root of ``L`` the critics learn, 2 (the default) or 4. Small costs count more beside large
-        ones to the fourth root; the square root has less bias where chance, or what no observation tells, decides on costs.
+    :param root: Root of ``L`` that the critics learn, 2 (the default) or 4. The fourth root weighs small costs more; the
+        square root has less bias if costs depend on noise or on unobserved variables.
     :param kwargs: The other arguments of ``SACPolicy``: ``activation_fn``, ``use_sde``, ``log_std_init``, ``use_expln``,
         ``clip_mean``, ``features_extractor_class``, ``features_extractor_kwargs``, ``normalize_images``, ``optimizer_class``,
         ``optimizer_kwargs`` (Adam is the fused one, unless they have ``fused``, ``foreach`` or ``differentiable``),

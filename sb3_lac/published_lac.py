@@ -23,8 +23,8 @@ from sb3_lac.updates import Metrics, backward
 
 class SumOfSquaresCritic(LyapunovCritic):
     """
-    Lyapunov critic of ``PublishedLAC``: ``L`` is the sum of the squares of the activations of the last layer, with which
-    ``net_arch`` ends. The arguments are those of ``LyapunovCritic``.
+    Lyapunov critic of ``PublishedLAC``: ``L`` is the sum of the squares of the last layer's activations, the end of
+    ``net_arch``. The arguments are those of ``LyapunovCritic``.
     """
 
     n_outputs = -1
@@ -42,13 +42,13 @@ class SumOfSquaresCritic(LyapunovCritic):
 
 class PublishedPolicy(LyapunovPolicy):
     """
-    Policy class (with both actor and critic) for ``PublishedLAC``: that of LAC, with a ``SumOfSquaresCritic``, a target actor,
-    and the networks of Han et al. (2020).
+    Policy class (with both actor and critic) for ``PublishedLAC``: the policy of LAC with a ``SumOfSquaresCritic``, a target
+    actor, and the networks of Han et al. (2020).
 
     :param observation_space: Observation space
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule (could be constant)
-    :param net_arch: Hidden layers of the actor (``pi``), and those of the critic (``qf``), whose last one is squared
+    :param net_arch: Hidden layers of the actor (``pi``) and of the critic (``qf``); the critic squares its last layer
     :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
     :param kwargs: The other arguments of ``LyapunovPolicy``
     """
@@ -86,13 +86,13 @@ class PublishedMultiInputPolicy(MultiInputPolicy, PublishedPolicy):
 
 class HorizonReplayBuffer(ReplayBuffer):
     """
-    Replay buffer that tells the sum of the rewards of ``horizon`` steps, from that of the transition on. Behind the end of an
-    episode, a time limit or a termination, its last reward goes on, as in the code of Han et al. (2020). The latest
-    transitions, whose horizon is not over yet, are not sampled. While fewer steps than a horizon are stored it is the oldest
-    transition that is, and the latest reward that goes on.
+    Return the sum of the rewards of ``horizon`` steps with each sampled transition, beginning with its own reward. After the
+    end of an episode (time limit or termination) the last reward continues, as in the code of Han et al. (2020). The buffer
+    does not sample the latest transitions before their horizon is over. If fewer steps than a horizon are stored, the buffer
+    samples the oldest transition, and continues the latest reward.
 
     :param args: Arguments of ``ReplayBuffer``
-    :param horizon: Number of steps whose rewards are summed
+    :param horizon: Number of steps in the sum of rewards
     :param kwargs: Arguments of ``ReplayBuffer``. ``optimize_memory_usage`` is not supported.
     """
 
@@ -148,24 +148,25 @@ class PublishedLAC(CostAlgorithm):
       model.learn(20_000)
 
     ``L(s, a)``, the sum of the squares of the critic's last layer, learns the discounted sum of costs or, with a ``horizon``,
-    the plain sum of the next ones. The actor lowers ``lambda d + beta log pi``, ``d = L(s', pi(s')) - L(s, a) + alpha3 cost``.
+    the plain sum of the next costs. The actor minimises ``lambda d + beta log pi``,
+    ``d = L(s', pi(s')) - L(s, a) + alpha3 cost``.
     ``lambda`` grows while ``d`` is above zero, and ``beta`` (``ent_coef``) while the entropy is below its target.
 
-    Defaults are those of the paper's table [P] or of the authors' code [C]. The code differs in these: a time limit is an end
-    (``replay_buffer_kwargs=dict(handle_timeout_termination=False)``); rates but that of ``lambda`` fall to zero
-    (``LinearSchedule(rate, 0.0, 1.0)``); ``alpha3`` is 0.1; and ``lambda`` is clipped when it is read, so that its logarithm
-    can wind up. Costs where rewards are positive are those of ``LAC``.
+    Defaults are those of the paper's table [P] or of the authors' code [C]. The authors' code has four differences: a time
+    limit is a termination (``replay_buffer_kwargs=dict(handle_timeout_termination=False)``); all learning rates except that of
+    ``lambda`` fall to zero (``LinearSchedule(rate, 0.0, 1.0)``); ``alpha3`` is 0.1; and ``lambda`` is clipped when read, so
+    that its logarithm can wind up. With positive rewards, costs are those of ``LAC``.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...), see ``PublishedPolicy`` for its networks [P]
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param learning_rate: learning rate of the actor and of ``ent_coef`` [P],
         it can be a function of the current progress remaining (from 1 to 0).
-        To change it, on a model or on loading, leaves the rates of critic and ``lambda`` as they are.
+        A change of this rate, on a model or on loading, does not affect the rates of critic and ``lambda``.
     :param buffer_size: size of the replay buffer [C]
     :param learning_starts: how many steps of the model to collect transitions for before learning starts [C]
     :param batch_size: Minibatch size for each gradient update [P]
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1) [P]
-    :param gamma: the discount factor [P]. 'auto' is the one that the environment states. It has no effect with a ``horizon``.
+    :param gamma: the discount factor [P]. 'auto' takes the environment's. Without effect if there is a ``horizon``.
     :param train_freq: Update the model every ``train_freq`` steps [C]
     :param gradient_steps: How many gradient steps to do after each rollout [C]
     :param action_noise: the action noise type (None by default)
@@ -176,8 +177,8 @@ class PublishedLAC(CostAlgorithm):
     :param target_update_interval: update the target networks every ``target_update_interval`` gradient steps.
     :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions [P]
     :param alpha3: Share of the cost by which ``L`` has to decrease in each step [P]
-    :param horizon: Number of costs whose plain sum is ``L``. It is 5 in four of the paper's five tasks [P]. ``None`` is the
-        discounted sum of all costs. Not with dictionary observations.
+    :param horizon: Number of costs in the plain sum ``L``, 5 in four of the paper's five tasks [P]. ``None`` is the discounted
+        sum of all costs. Not with dictionary observations.
     :param critic_learning_rate: learning rate of the critic [P], it can be a function of the current progress remaining
     :param lambda_learning_rate: learning rate of ``lambda`` [C], it can be a function of the current progress remaining
     :param lambda_init: Initial value of ``lambda`` [C]

@@ -25,12 +25,12 @@ class GymnasiumVecEnv(VecEnv):
       env = gym.make_vec("BatteryQmax-v0", num_envs=64, autoreset_mode="SameStep")
       model = LAC("MlpPolicy", VecMonitor(GymnasiumVecEnv(env))).learn(100_000)
 
-    ``autoreset_mode`` is ``"SameStep"``, as Stable-Baselines3 expects, or ``"Disabled"``. With Gymnasium's default a new
-    episode starts one step late, and the replay buffer would hold transitions from the end of one episode to the start of the
+    ``autoreset_mode`` is ``"SameStep"``, as Stable-Baselines3 expects, or ``"Disabled"``. Gymnasium's default starts a new
+    episode one step late, so that the replay buffer would contain transitions from the end of an episode to the start of the
     next.
 
     :param env: The vector environment, wrapped or not
-    :raises ValueError: If it starts new episodes one step late, or does not say when
+    :raises ValueError: If the environment starts new episodes one step late, or does not state when
     """
 
     actions: np.ndarray

@@ -56,22 +56,22 @@ def _noise_std(name: str, std: float | Sequence[float], n: int) -> np.ndarray | 
 
 class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     """
-    A control problem with a cost: the reward is ``-cost``. ``info`` holds ``"cost"``, and ``"error"``, the distance to the
-    goal after the step (``error_name`` says which, and its unit), as it is and not as noise shows it; that of ``reset()``
-    holds the error of the start.
+    A control problem with a cost: the reward is ``-cost``. ``info`` has ``"cost"``, and ``"error"``, the distance to the goal
+    after the step, of the true state without noise (``error_name`` has its name and unit). The ``info`` of ``reset()`` has the
+    initial error.
 
     Actions lie in [-1, 1]; each problem scales them. ``reset(options={"state": ...})`` starts from a given state.
 
-    The disturbances are arguments of every problem, and off by default. A reference controller does not know of them. They are
-    the same in all episodes, or random in each: a policy that is trained so learns a plant that changes.
+    The disturbances are arguments of every problem, and off by default. A reference controller does not know them. They are
+    the same in all episodes, or random in each episode (domain randomisation).
 
     :param parameters: Physical parameters of the problem by name. They become attributes of the environment
     :param state_low: Smallest value of each state variable, shape (n,)
     :param state_high: Largest value of each state variable, shape (n,); states are clipped to these limits
-    :param observation_space: What the agent sees, see ``_observation()``
+    :param observation_space: Space of the observations, see ``_observation()``
     :param n_actions: Number of actions
-    :param changed_parameters: Disturbance: those of ``parameters`` in which the plant differs from what is known of it
-    :param impulse: Disturbance: size of a push for one step, in a random direction; each problem says what is pushed
+    :param changed_parameters: Disturbance: values of ``parameters`` other than the nominal ones
+    :param impulse: Disturbance: size of a push for one step, in a random direction; each problem names the pushed variable
     :param impulse_interval: Steps from one push to the next
     :param process_noise: Disturbance: standard deviation of the Gaussian noise that is added to each state variable in each
         step, in its unit; one number for all, or one for each
@@ -80,8 +80,8 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     :param drawn: Disturbances that each episode samples anew, uniformly, in place of what is fixed: by name the smallest and
         the largest value of any of ``parameters``, ``impulse``, ``process_noise``, ``observation_noise`` and
         ``action_delay``. ``info["drawn"]`` tells what was sampled
-    :param last_actions: How many of the last actions are added to the end of an observation, the latest first, zeros before
-        the start: what a policy needs to know of actions that are still to take effect
+    :param last_actions: Number of last actions added to the end of an observation, the latest first, zeros before the start.
+        With a delay the policy needs these actions
     :param render_mode: ``"rgb_array"`` for pictures of the plant and of the episode so far, or None
     """
 

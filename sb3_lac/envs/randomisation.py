@@ -50,8 +50,8 @@ class Randomisation:
 
 class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """
-    Domain randomisation of any environment: each episode samples attributes of ``env.unwrapped`` anew, so that a policy is
-    trained for a plant that changes. The cost environments do this by their own argument ``drawn``.
+    Domain randomisation of any environment: each episode samples attributes of ``env.unwrapped`` anew. The cost environments
+    have their own argument ``drawn`` for this.
 
     .. code-block:: python
 
@@ -59,14 +59,14 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
       _, info = env.reset(seed=0)
       print(info["drawn"])
 
-    They must be numbers that the environment reads while it runs: what it has copied, as into a simulator, stays as it is.
-    Those that lie deeper are named by their path, as ``"model.opt.gravity[2]"`` and ``"model.body_mass[1]"`` of MuJoCo. For a
-    factor of a whole array give the environment a property that sets the array, and randomise that.
+    The attributes must be numbers that the environment reads in each step: a copy, for example inside a simulator, stays
+    unchanged. Name nested attributes by their path, such as ``"model.opt.gravity[2]"`` and ``"model.body_mass[1]"`` of MuJoCo.
+    For a factor of a whole array, give the environment a property that sets the array, and randomise the property.
 
     :param env: The environment
-    :param drawn: Smallest and largest value of each attribute, in its unit; sampled uniformly, and in whole numbers where the
-        attribute and both ends are
-    :raises ValueError: If an attribute is no number of the environment, or a range makes no sense
+    :param drawn: Smallest and largest value of each attribute, in its unit; sampled uniformly, as integers if the attribute
+        and both limits are integers
+    :raises ValueError: If an attribute is not a number of the environment, or a range is invalid
     """
 
     def __init__(self, env: gym.Env[Any, Any], drawn: Ranges) -> None:

@@ -36,9 +36,9 @@ def _linearised(model: CostEnv, at_rest: float = 0.0) -> tuple[np.ndarray, np.nd
 
 class ReferenceController(ABC):
     """
-    A controller with the ``predict()`` of a model of Stable-Baselines3. It has no memory and no randomness.
+    A controller with the ``predict()`` of a model of Stable-Baselines3, without memory or randomness.
 
-    :param model: The problem as it is known, without disturbances
+    :param model: The nominal problem, without disturbances
     """
 
     def __init__(self, model: CostEnv) -> None:
@@ -225,12 +225,12 @@ def reference_controller(env: gym.Env[Any, Any]) -> ReferenceController:
     """
     The reference controller of a cost environment, to compare policies with.
 
-    It is made for the problem without disturbances: with ``changed_parameters`` it is as surprised as a policy that was
-    trained without. For parameters that are known, give them as arguments of their own.
+    The controller is designed for the problem without disturbances, and does not know ``changed_parameters``. Known parameters
+    are arguments of the environment.
 
     :param env: One of the cost environments; wrappers must leave observations and actions as they are
     :return: The controller
-    :raises ValueError: If there is none for this environment
+    :raises ValueError: If this environment has no reference controller
     """
     problem = env.unwrapped
     make_controller = _CONTROLLERS.get(type(problem))  # type: ignore[arg-type]

@@ -35,21 +35,21 @@ NEEDS = {
 @dataclass(frozen=True, eq=False)
 class CertificationReport:
     """
-    What ``certify()`` returns: statements about a closed loop that hold together with 95 % confidence. Read ``summary()``
-    first; ``statements`` has its numbers.
+    Result of ``certify()``: statements about a closed loop that hold together with 95 % confidence. Read ``summary()`` first;
+    ``statements`` has its numbers.
 
-    :param statements: One row per statement, by name: ``n_episodes`` that testify, ``n_true`` of them for it, their ``share``,
-        and ``at_least``, which the probability is not below with the confidence
+    :param statements: One row per statement, by name: the number ``n_episodes`` of counted episodes, the number ``n_true`` of
+        true ones, their ``share``, and ``at_least``, the lower bound of the probability
     :param transitions: One row per transition of those episodes: ``episode``, ``step``, ``reward``, ``cost``, ``terminated``,
         ``lyapunov`` if there is a function, and others
     :param episodes: One row per episode: ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost``, ``terminated``,
-        and one column per statement: 1 if it was true, 0 if not, NaN if the episode does not testify
-    :param starts: One row per start state on the grid: ``state_0`` and so on, ``n_episodes``, ``n_attracted``, their ``share``
-        with its exact interval ``low`` and ``high``; None if no start states were given
+        and one column per statement: 1 if true, 0 if not, NaN if the episode does not count
+    :param starts: One row per initial state on the grid: ``state_0`` and so on, ``n_episodes``, ``n_attracted``, their
+        ``share`` with its exact interval ``low`` and ``high``; None without given initial states
     :param ultimate_bound: The cost to stay within, None if there is none
-    :param own_bound: Whether that is the one of the function, which only this loop is measured by
-    :param level: Value of the function above which it has to decrease, None if there is none
-    :param window_steps: Over how many steps, None if there is none
+    :param own_bound: Whether this cost is the function's own bound, which no other loop is measured by
+    :param level: Value of the function above which the function has to decrease, None if there is none
+    :param window_steps: Number of steps of this decrease, None if there is none
     :param description: The policy, the environment and the seed
     """
 
@@ -160,7 +160,7 @@ def certify(
     seed: int | None = None,
 ) -> CertificationReport:
     """
-    Bound from below, with 95 % confidence, how probable it is that an episode survives, comes to rest, and decreases ``L``.
+    Bound from below, with 95 % confidence, the probability that an episode survives, settles, and decreases ``L``.
 
     .. code-block:: python
 
@@ -173,29 +173,28 @@ def certify(
       lyapunov = fit_lyapunov(controller, env, n_episodes=20, seed=0)
       print(certify(controller, env, lyapunov=lyapunov, n_episodes=100, seed=1000).summary())
 
-    Each statement is a question that an episode answers with yes or no. The bound is that of Clopper and Pearson (1934), which
-    only assumes independent episodes: 300 of 300 means at least 99 % for one statement, and 98.6 % for each of three. The
-    statements are
+    Each statement is a yes-or-no question for an episode. The bound of Clopper and Pearson (1934) only assumes independent
+    episodes: 300 of 300 means at least 99 % for one statement, and 98.6 % for each of three. The statements are
 
     - ``survives``: no termination
     - ``stays_within``: survives, and no cost in the last fifth of the episode is above ``ultimate_bound``
-    - ``decreases``: survives, and ``L`` is lower ``lyapunov.window_steps`` later wherever it is above ``lyapunov.level``. Only
-      episodes with such a window testify, and those that died.
+    - ``decreases``: survives, and ``L`` is lower ``lyapunov.window_steps`` later wherever ``L`` is above ``lyapunov.level``.
+      Only episodes with such a window, and terminated episodes, count.
 
-    Thresholds must not be chosen on the episodes that are counted. A fitted function brings those of its own roll-outs: the
-    largest late cost, the largest late value, and the shortest window over which it decreased.
+    Do not choose thresholds on the counted episodes. A fitted function brings the thresholds of its own roll-outs: the largest
+    late cost, the largest late value, and the shortest window of a decrease.
 
     :param policy: A model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
-    :param env: The environment, wrapped as that of the training. Several at once are faster.
+    :param env: The environment, wrapped as that of the training. Several environments at once are faster.
     :param lyapunov: The function, if decrease is to be certified
     :param n_episodes: Number of episodes
-    :param ultimate_bound: The cost to stay within, that of ``lyapunov`` by default. Each fit brings another one: to compare
-        loops, state one for all of them.
-    :param starts: Start states on a grid, shape (n, n_states), each handed to ``env.reset(options={"state": ...})``
-    :param n_episodes_per_start: Number of episodes from each of them
+    :param ultimate_bound: The cost to stay within, by default that of ``lyapunov``. Each fit has another bound: to compare
+        loops, state one bound for all.
+    :param starts: Initial states on a grid, shape (n, n_states), each passed to ``env.reset(options={"state": ...})``
+    :param n_episodes_per_start: Number of episodes from each initial state
     :param deterministic: Whether to certify the mean action or sampled actions
-    :param seed: Seed of the episodes, which cannot be one that ``lyapunov`` was fitted on, and should be none that the policy
-        was trained with; drawn if it is None, and named in the description of the report
+    :param seed: Seed of the episodes, not a seed of the fit (refused) or of the training; drawn if None, and named in the
+        report's description
     :return: The report
     :raises ValueError: If an argument is invalid
     """

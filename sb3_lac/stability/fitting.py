@@ -94,16 +94,16 @@ class InputRange:
 
 class FittedLyapunov(LyapunovFunction):
     """
-    A Lyapunov function that ``fit_lyapunov()`` learned: a network, and what its roll-outs say about the loop. Of the episodes
-    that did not terminate, ``ultimate_bound`` is the largest cost in their last fifth, ``level`` the largest value there, and
-    ``window_steps`` the shortest window over which the function decreased wherever it started above that level.
+    A Lyapunov function learned by ``fit_lyapunov()``: a network, and thresholds from its roll-outs. For the episodes without a
+    termination, ``ultimate_bound`` is the largest cost in their last fifth, ``level`` the largest value there, and
+    ``window_steps`` the shortest window over which the function decreased from every value above that level.
 
     :param network: Sum of squares of the scaled observations
-    :param inputs: The observations that it has seen
+    :param inputs: The observations of the fit
     :param unit: Costs per output of the network
-    :param floor: The least value on the roll-outs, which is subtracted: values below it are 0
-    :param average_cost: Cost per step where the loop settles
-    :param reward_bound: The reward that costs nothing
+    :param floor: The smallest value on the roll-outs, subtracted from all values; values below the floor are 0
+    :param average_cost: Cost per step of the settled loop
+    :param reward_bound: The reward without cost
     :param seeds: Seeds of the environments of the roll-outs
     """
 
@@ -146,8 +146,8 @@ def fit_lyapunov(
     progress_bar: bool = True,
 ) -> FittedLyapunov:
     """
-    Learn a Lyapunov function of the loop that a policy closes, on roll-outs of that policy. Any policy will do: one of any
-    algorithm, or a controller that nobody trained.
+    Learn a Lyapunov function of a closed loop, on roll-outs of its policy. The policy may be of any algorithm, or a classical
+    controller.
 
     .. code-block:: python
 
@@ -161,25 +161,24 @@ def fit_lyapunov(
     Judge it on other episodes, with ``evaluate_lyapunov()`` and ``certify()``.
 
     The function is the relative value of the average cost, ``L(s) = c - c_bar + E[L(s')]``. Its exact drift is
-    ``E[L(s')] - L(s) = -(c - c_bar)``: it decreases by all of the cost (alpha3 = 1) up to the residual ``b = c_bar``, the mean
-    cost at which the loop comes to rest, however slow the loop is. (The value of a discounted cost decreases by a share only,
-    which shrinks as the loop gets slower.) ``L`` is a sum of squares less its least value on the roll-outs, and so never
-    negative. It is fitted to multi-step returns, which are computed anew before each pass over the data.
+    ``E[L(s')] - L(s) = -(c - c_bar)``: ``L`` decreases by all of the cost (alpha3 = 1) up to the residual ``b = c_bar``, the
+    mean cost of the settled loop, in fast and slow loops alike. (The value of a discounted cost decreases by a share only, and
+    the share shrinks in slower loops.) ``L`` is a sum of squares minus its smallest value on the roll-outs, and therefore
+    never negative. The fit uses multi-step returns, computed anew before each pass over the data.
 
-    The reward that costs nothing is the largest one of the roll-outs, and at least 0. A transition that ends in a death has no
-    next value: what it costs is its cost, and with positive rewards also those that a survivor could have had until the end of
-    the longest episode.
+    The reward without cost is the largest reward of the roll-outs, and at least 0. A terminal transition has no next value.
+    With positive rewards, its cost includes the missed rewards until the end of the longest episode.
 
     :param policy: A model of Stable-Baselines3, or anything with ``predict(observation, deterministic=...)``
     :param env: The environment, wrapped as that of the training. Costs are of its own rewards, without ``VecNormalize``.
     :param n_episodes: Number of episodes to learn from
-    :param deterministic: Whether the loop is that of the mean action, as it is used after the training
+    :param deterministic: Whether to use the mean action, as after the training, or sampled actions
     :param seed: Seed of the roll-outs and of the network; drawn if it is None
     :param progress_bar: Whether to show the progress, in a terminal
-    :return: The function. It is to be judged on other roll-outs: ``evaluate_lyapunov()`` and ``certify()`` refuse its seeds,
-        which it keeps in ``seeds``.
+    :return: The function. Judge it on other roll-outs: ``evaluate_lyapunov()`` and ``certify()`` refuse the seeds of the fit
+        (``seeds``).
     :raises ValueError: If an argument is invalid
-    :raises NoCostError: If nothing had a cost on the roll-outs, which say nothing about decrease then
+    :raises NoCostError: If no transition of the roll-outs had a cost
     """
     with closed_loop(policy, env, None, n_episodes, deterministic, seed) as loop:
         roll_outs = loop.roll_out(n_episodes)
@@ -194,7 +193,7 @@ def fit_lyapunov(
 
 class NoCostError(ValueError):
     """
-    Nothing had a cost on the roll-outs, so that there is nothing that a Lyapunov function could decrease by.
+    No transition of the roll-outs had a cost, so that a Lyapunov function has nothing to decrease by.
 
     :param mean_reward: Mean over episodes of the sum of their rewards
     """

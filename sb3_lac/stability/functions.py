@@ -17,8 +17,8 @@ _NUMBER = (float, int, np.number)
 
 class LyapunovFunction:
     """
-    A Lyapunov function that is known, for instance from a Riccati equation. ``evaluate_lyapunov()`` and ``certify()`` judge it
-    like one that was learned.
+    A known Lyapunov function, for instance from a Riccati equation. ``evaluate_lyapunov()`` and ``certify()`` judge it like a
+    learned function.
 
     .. code-block:: python
 
@@ -30,14 +30,14 @@ class LyapunovFunction:
       squares = LyapunovFunction(lambda states: (states**2).sum(axis=1))
       print(evaluate_lyapunov(reference_controller(env), env, lyapunov=squares, seed=0).summary())
 
-    Costs are ``c = max(reward_bound - reward, 0)``, or ``c = -reward`` if no bound is given and no reward is positive.
-    What ``certify()`` asks about, ``ultimate_bound``, ``level`` and ``window_steps``, is known of a fitted function, and may
-    be set as attributes of any other.
+    Costs are ``c = max(reward_bound - reward, 0)``, or ``c = -reward`` if no bound is given and no reward is positive. A
+    fitted function has the thresholds of ``certify()``: ``ultimate_bound``, ``level`` and ``window_steps``. For any other
+    function, set these attributes.
 
-    :param function: Values, an array of shape (n,), of n observations as the policy sees them
+    :param function: Function of n observations of the policy that returns their values, an array of shape (n,)
     :param alpha3: Share of the cost by which the function is meant to decrease
-    :param gamma: Discount factor of the costs to come that it estimates
-    :param reward_bound: The reward that costs nothing, needed where rewards are positive
+    :param gamma: Discount factor of the estimated cost
+    :param reward_bound: The reward without cost, needed if rewards are positive
     :raises ValueError: If a number is invalid
     """
 

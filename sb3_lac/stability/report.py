@@ -63,8 +63,8 @@ def _shown(interval: Interval) -> str:
 @dataclass(frozen=True, eq=False)
 class LyapunovReport:
     """
-    What ``evaluate_lyapunov()`` returns: the metrics of ``L`` along roll-outs of a policy, and their verdict. Read
-    ``summary()`` first, then ``holds``; ``plot()`` shows where the condition fails.
+    Result of ``evaluate_lyapunov()``: the metrics of ``L`` along roll-outs of a policy, and their verdict. Read ``summary()``
+    first, then ``holds``; ``plot()`` shows where the condition fails.
 
     :param transitions: One row per transition, episodes one after the other: ``episode``, ``step``, ``reward``, ``cost``,
         ``lyapunov`` (``L(s, a)``), ``next_lyapunov`` (``L(s', a')``, NaN if s' is terminal), ``difference``
@@ -72,7 +72,7 @@ class LyapunovReport:
     :param episodes: One row per episode: ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost`` and
         ``late_cost`` (the largest and the mean one of its last fifth), ``late_rise`` (by how much that mean is larger than
         those of the three fifths before), ``terminated``
-    :param observations: The observations of the transitions as the policy saw them, or None if they are no vectors
+    :param observations: The policy's observations of the transitions, or None if they are not vectors
     :param metrics: Values with their 95 % intervals, by name
     :param by_cost: The decrease condition by level of the cost: ``cost_low``, ``cost_high``, ``cost`` (mean),
         ``n_transitions``, ``drift`` (mean of ``L(s', a') - L(s, a)``), ``decrease``, ``decrease_low``, ``decrease_high``,
@@ -258,8 +258,8 @@ def evaluate_lyapunov(
     lyapunov: LyapunovFunction | None = None,
 ) -> LyapunovReport:
     """
-    Measure on roll-outs whether ``L`` is a Lyapunov function of the loop that a policy closes: whether it decreases by
-    ``alpha3`` times the cost, ``E[L(s', a')] - L(s, a) <= -alpha3 * c``, at least where the cost is above a residual.
+    Measure on roll-outs whether ``L`` is a Lyapunov function of a closed loop: whether ``L`` decreases by ``alpha3`` times the
+    cost, ``E[L(s', a')] - L(s, a) <= -alpha3 * c``, at least at costs above a residual.
 
     .. code-block:: python
 
@@ -273,11 +273,11 @@ def evaluate_lyapunov(
       report = evaluate_lyapunov(controller, env, n_episodes=20, lyapunov=lyapunov, seed=1000)
       print(report.summary())
 
-    Take the function of ``fit_lyapunov()`` for a verdict on the loop. Without ``lyapunov``, the critic of LAC is judged, which
-    tells what was learned. ``docs/stability_metrics.md`` says what each metric means.
+    Use the function of ``fit_lyapunov()`` for a verdict on the loop. Without ``lyapunov``, LAC's own critic is judged.
+    ``docs/stability_metrics.md`` defines each metric.
 
-    ``a'`` is the action taken next; after a time limit it is an action of the policy. A terminal state has no ``L``:
-    transitions into it are counted as deaths, and do not count for the decrease.
+    ``a'`` is the next action; after a time limit it is an action of the policy. A terminal state has no ``L``: transitions
+    into a terminal state count as deaths, and not for the decrease.
 
     .. note::
         The critic is judged with the costs that it was trained on: wrap ``env`` as the training environment. Any other
@@ -288,9 +288,9 @@ def evaluate_lyapunov(
     :param env: The gym environment or ``VecEnv`` environment, not the one that the policy trains in. Its normalization
         statistics are used as they are: call ``sync_envs_normalization()`` before.
     :param n_episodes: Number of episodes, divided onto the elements of a vector env as in ``evaluate_policy()``
-    :param deterministic: Whether to judge the policy's mean action, as it is used after the training, or sampled actions
+    :param deterministic: Whether to judge the policy's mean action, as after the training, or sampled actions
     :param seed: Seed for ``env`` and for the actions; drawn if it is None, and kept in the report
-    :param lyapunov: The function to judge, the critic by default. It cannot be judged on roll-outs that it was fitted on.
+    :param lyapunov: The function to judge, the critic by default. The roll-outs of its own fit are refused.
     :return: The report
     :raises ValueError: If an argument is invalid, or the policy is not LAC and there is no ``lyapunov``
     """

@@ -23,9 +23,9 @@ MAX_TAIL_WEIGHT = 0.05
 
 class Interval(NamedTuple):
     """
-    A statistic and its 95 % confidence interval, NaN where there is none, infinite on a side that is not limited.
+    A statistic and its 95 % confidence interval; NaN without an interval, infinite on an unlimited side.
 
-    :param value: Of all roll-outs
+    :param value: Value over all roll-outs
     :param low: Lower end of the interval
     :param high: Upper end of the interval
     """
