@@ -57,7 +57,7 @@ def environment_page(env_id: str) -> str:
     path, end = f"../pictures/{env_id}", "The end of the same episode of the reference controller, as `render()` draws it."
     picture = f"![{env_id} in motion]({path}.gif)\n\n*{EPISODES[env_id].caption}*\n\n"
     picture += f"![States and costs of {env_id}]({path}.png)\n\n*{end}*\n\n"
-    made = f'`gym.make("sb3_lac:{env_id}")` makes it, without an import of `sb3_lac`.\n\n'
+    made = f'Create this environment with `gym.make("sb3_lac:{env_id}")`; no import of `sb3_lac` is needed.\n\n'
     return f"# {env_id}\n\n{made}{picture}" + re.sub(rf"``((?!{env_id}\b)\w+-v\d+)``", r"[`\1`](\1.md)", page) + "\n"
 
 

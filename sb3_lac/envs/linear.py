@@ -22,9 +22,9 @@ class LinearCostEnv(CostEnv):
     """
     ## Description
 
-    A lightly damped oscillator that a force brings to rest, with a little noise: the linear-quadratic regulator.
-    Everything that LAC learns can be computed exactly here: the best policy (`optimal_gain`), the value L of a linear policy
-    (`cost_to_go`), and the largest alpha3 that the decrease condition allows (`largest_feasible_alpha3`).
+    A force has to bring a lightly damped oscillator with a little noise to rest: the linear-quadratic regulator problem.
+    LAC can be compared with exact solutions here: the best policy (`optimal_gain`), the value L of a linear policy
+    (`cost_to_go`), and the largest feasible alpha3 of the decrease condition (`largest_feasible_alpha3`).
 
         s' = A s + B u + w,    A = [[0.96, 0.2], [-0.2, 0.96]],  B = [[0], [0.5]],  w ~ N(0, noise_std^2 I)
 
@@ -65,8 +65,8 @@ class LinearCostEnv(CostEnv):
 
     ## Reference Controller
 
-    The linear-quadratic regulator, which is the optimum, costs 0.028 per step on average over 100 episodes; what it leaves is
-    the noise. 100 of 100 end with an error below 0.1, the largest is 0.057.
+    The linear-quadratic regulator is the optimum. It costs 0.028 per step on average over 100 episodes, because of the
+    noise. 100 of 100 end with an error below 0.1, the largest is 0.057.
 
     ## Version History
 
