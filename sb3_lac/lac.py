@@ -21,10 +21,10 @@ class LAC(CostAlgorithm):
     This implementation uses the SB3 SAC implementation as base.
     Paper: https://arxiv.org/abs/2004.14288
 
-    It changes the published algorithm, which is ``PublishedLAC``. Two critics learn the square root of what ``L`` is above its
-    lowest value, in which small costs count beside large ones; the published one learns ``L`` itself, as a sum of squares. The
-    actor lowers that root in the sampled states; the published one lowers the condition on ``L``, in the next states. Targets
-    have the mean action of the actor; the published ones sampled actions of a target actor.
+    It changes the published algorithm, which is ``PublishedLAC``. Two critics learn a root of what ``L`` is above its lowest
+    value, in which small costs count beside large ones; the published one learns ``L`` itself, as a sum of squares. The actor
+    lowers the square root of ``L`` in the sampled states; the published one lowers the condition on ``L``, in the next states.
+    Targets have the mean action of the actor; the published ones sampled actions of a target actor.
 
     .. code-block:: python
 
@@ -36,7 +36,7 @@ class LAC(CostAlgorithm):
 
     Pay costs as they are, ``reward = -cost``, and let a failure have its price. Choose the discount, the learning rate and the
     number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. Rare events that cost a lot are
-    underrated: take SAC. Where a loop has to settle near its goal on a known plant, try ``policy_kwargs=dict(root=4)``.
+    underrated: take SAC.
 
     The critic ``L(s, a) >= 0`` is the discounted sum of costs. It has to decrease by ``alpha3`` times the cost in each step: a
     Lagrange multiplier ``lambda`` enforces that, while ``ent_coef`` keeps the entropy up as in SAC.
@@ -229,8 +229,8 @@ class LAC(CostAlgorithm):
         # Compute critic loss, with the current root of each critic network
         # using action from the replay buffer (all values are relative to the offset)
         target_values = self._target_values(replay_data, next_actions)
-        # The floor follows the lowest value as the target critic follows the critic
-        self.critic.floor.lerp_(target_values.min(), self.tau)
+        # The metric follows the values as the target critic follows the critic
+        self.critic.follow(target_values, self.tau)
         target_roots = self.critic.root(target_values)
         current_roots = self.critic.outputs(replay_data.observations, replay_data.actions)
         critic_loss = 0.5 * sum(F.mse_loss(current_root, target_roots) for current_root in current_roots)
@@ -274,6 +274,7 @@ class LAC(CostAlgorithm):
         if update_targets:
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
             self.critic_target.floor.lerp_(self.critic.floor, self.tau)
+            self.critic_target.scale.copy_(self.critic.scale)
             # Copy running stats, see GH issue #996
             polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
