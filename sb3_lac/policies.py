@@ -146,10 +146,10 @@ class RootCritic(LyapunovCritic):
     ``L = offset + floor + sign(f) d^2`` with ``d = f^2 / (scale + |f|)``.
 
     Costs of a loop that settles fade over orders of magnitude. A relative error of ``L`` is a thousand times larger at a
-    thousand times the cost, and one of a square root 32 times, of a fourth root less than six times. With noise ``L`` is biased
-    low: the root of a mean is larger than the mean of the roots. The bias is that of a square root where costs are large, as
-    where a loop may crash, and the resolution that of a fourth root where the loop comes to rest. The scale between the two
-    follows the values, so that the unit of the costs is nothing but a factor of ``f``.
+    thousand times the cost, and one of a square root 32 times, of a fourth root less than six times. With noise ``L`` is
+    biased low: the root of a mean is larger than the mean of the roots. The bias is that of a square root where costs are
+    large, as where a loop may crash, and the resolution that of a fourth root where the loop comes to rest. The scale between
+    the two follows the values, so that the unit of the costs is nothing but a factor of ``f``.
 
     The floor follows the lowest value. What all values have in common falls slowly while the loop gets better, if the discount
     is near 1: a root from zero on would be flat just where the loop comes to rest. What is learned is a relative value, as in

@@ -178,7 +178,7 @@ def test_the_default_root_is_a_fourth_near_the_floor_and_a_square_one_far_above_
 
 
 def test_one_that_is_no_root_is_refused_and_roots_are_of_lac_alone(make_model):
-    with pytest.raises(ValueError, match="root=3 must be 'mixed', 2 .* or 4"):
+    with pytest.raises(ValueError, match=r"root=3 must be 'mixed', 2 .* or 4"):
         make_model(policy_kwargs={"root": 3})
     with pytest.raises(TypeError, match="root"):
         make_model(algorithm=PublishedLAC, policy_kwargs={"root": 2})
