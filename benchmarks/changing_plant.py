@@ -1,6 +1,6 @@
 """
-A plant that changes: LAC, also with a square root, SAC and TQC, all with LAC's one setting, trained on control problems that
-draw all of their disturbances anew for each episode.
+A plant that changes: LAC, also with a square and with a fourth root, SAC and TQC, all with LAC's one setting, trained on
+control problems that draw all of their disturbances anew for each episode.
 
 .. code-block:: bash
 
@@ -48,6 +48,7 @@ TIMESTEPS = 30_000
 ALGORITHMS = {
     "lac": ("LAC", "sb3_lac:LAC"),
     "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC"),
+    "lac_fourth_root": ("LAC (root=4)", "sb3_lac:LAC"),
     "sac": ("SAC", "stable_baselines3:SAC"),
     "tqc": ("TQC", "sb3_contrib:TQC"),
 }
@@ -87,7 +88,7 @@ def run_of(env_id: str, algorithm: str, seed: int, last_actions: int = 0, timest
     environment = {"drawn": drawn(env_id), "impulse_interval": IMPULSE_INTERVAL}
     if last_actions:
         label, environment["last_actions"] = f"{label}, {last_actions} last actions", last_actions
-    root = {"lac": 4, "lac_square_root": 2}.get(algorithm)
+    root = {"lac_fourth_root": 4, "lac_square_root": 2}.get(algorithm)
     return Run(env_id, label, kind, seed, timesteps or TIMESTEPS, setting_of_lac(root), environment)
 
 

@@ -31,7 +31,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from battery_env.plotting import coloured, draw_over_seeds
 from benchmarks.control import roll_out
-from benchmarks.runs import POINTS, Run, make_rows, rows_command_line, setting_of_lac
+from benchmarks.runs import AT_THE_END, POINTS, Run, make_rows, rows_command_line, setting_of_lac
 from benchmarks.study import Study, add_legend, digits, markdown, new_panels, with_interval
 
 #: Environment steps of each task, the cheap ones first.
@@ -94,7 +94,6 @@ TUNED: dict[str, dict[str, dict[str, Any]]] = {
 }
 EPISODES = 20
 _CURVE = {100 * point // POINTS: f"after_{100 * point // POINTS}_percent" for point in range(1, POINTS + 1)}
-RETURN = _CURVE[100]
 
 
 def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -> Run:
@@ -139,7 +138,7 @@ def _interval(statistic: Any, scores: Sequence[np.ndarray]) -> tuple[float, floa
 
 def comparison(rows: pd.DataFrame) -> pd.DataFrame:
     """LAC against each rival, on each task and on all that both have rows of."""
-    scores = {key: group[RETURN].to_numpy() for key, group in rows.groupby(["task", "algorithm"], sort=False)}
+    scores = {key: group[AT_THE_END].to_numpy() for key, group in rows.groupby(["task", "algorithm"], sort=False)}
     found = []
     for ours, rival in product(OURS, RIVALS):
         tasks = [task for task in TASKS if (task, ours) in scores and (task, rival) in scores]
@@ -159,7 +158,7 @@ def report(rows: pd.DataFrame, compared: pd.DataFrame) -> str:
     returns = [
         {"task": task, "steps": str(of_task["timesteps"].max()), "seeds": str(of_task["seed"].nunique())}
         | {
-            label: with_interval(own[RETURN]) if len(own := of_task[of_task["algorithm"] == name]) else ""
+            label: with_interval(own[AT_THE_END]) if len(own := of_task[of_task["algorithm"] == name]) else ""
             for name, label in shown.items()
         }
         for task, of_task in rows.groupby("task", sort=False)

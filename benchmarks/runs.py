@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from inspect import signature
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -39,9 +40,13 @@ from benchmarks.study import Study, command_line, digest_of, importable, natural
 
 #: A policy is judged so often while it is trained, at even distances, of which the last is the end.
 POINTS = 10
+#: The column of the last time.
+AT_THE_END = "after_100_percent"
 #: What is lost at most when a training is killed.
 CHECKPOINT_EVERY_S = 120.0
 _KEY = ["task", "algorithm", "seed", "timesteps", "package", "configuration"]
+#: Arguments of algorithms that a run states elsewhere, or that change nothing but rounding.
+NOT_LEARNING = {"seed", "verbose", "device", "tensorboard_log", "stats_window_size", "compile_update", "_init_setup_model"}
 _SETTING_OF_LAC = Path(__file__).parents[1] / "zoo_configs" / "lac.yml"
 
 
@@ -79,9 +84,22 @@ class Run:
         """What tells its row from others. A class is known by its package and the release, or the one to come."""
         package, name = self.kind.split(":")
         release = importlib.import_module(package).__version__.partition(".dev")[0]
-        configuration = {"class": name, "settings": self.settings, "environment": self.environment}
+        configuration = {"class": name, "settings": self.settings, "environment": self.environment, "defaults": self.defaults}
         values = (self.task, self.algorithm, self.seed, self.timesteps, f"{package} {release}", json.dumps(configuration))
         return dict(zip(_KEY, values, strict=True))
+
+    @property
+    def defaults(self) -> dict[str, Any]:
+        """What the class has where nothing is stated: a change of a default makes another training."""
+        critic = getattr(self.type.policy_aliases["MlpPolicy"], "critic_class", None)
+        parameters = [each for kind in (self.type, critic) if kind for each in signature(kind).parameters.values()]
+        networks = eval(self.settings.get("policy_kwargs", "dict()"), {"nn": th.nn})
+        stated = NOT_LEARNING | set(self.settings) | set(networks)
+        return {
+            each.name: each.default
+            for each in parameters
+            if isinstance(each.default, int | float | str) and each.name not in stated
+        }
 
     @property
     def name(self) -> str:

@@ -57,7 +57,12 @@ def own_versions() -> dict[str, str]:
 
 def versions() -> dict[str, str]:
     """The versions that a result depends on."""
-    found = {**own_versions(), "python": platform.python_version(), "processor": platform.machine()}
+    found = {
+        **own_versions(),
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "processor": platform.machine(),
+    }
     for package in _PACKAGES:
         try:
             found[package] = version(package)

@@ -32,7 +32,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
 from battery_env.files import replacing
-from benchmarks.runs import save_checkpoint
+from benchmarks.runs import NOT_LEARNING, save_checkpoint
 from benchmarks.study import digest_of, own_versions, recall, versions, write_json, write_text
 from sb3_lac.discounts import DEFAULT_DISCOUNT
 from sb3_lac.zoo import LACExperimentManager, find_config
@@ -40,8 +40,6 @@ from sb3_lac.zoo import LACExperimentManager, find_config
 #: Environment steps with the algorithms' own hyperparameters, which name none.
 DEFAULTS_TIMESTEPS = 20_000
 _LABELS = {"published_lac": "LAC as published"}
-# arguments of algorithms that the recipe states elsewhere, or that change nothing but rounding
-_NOT_LEARNING = {"seed", "verbose", "device", "tensorboard_log", "stats_window_size", "compile_update", "_init_setup_model"}
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ class Recipe:
         arguments = {
             name: parameter.default
             for name, parameter in inspect.signature(kind).parameters.items()
-            if parameter.default is not parameter.empty and name not in _NOT_LEARNING | set(entry)
+            if parameter.default is not parameter.empty and name not in NOT_LEARNING | set(entry)
         }
         if arguments.get("gamma") == "auto":
             arguments["gamma"] = metadata.get("discount", DEFAULT_DISCOUNT)

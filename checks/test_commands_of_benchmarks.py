@@ -44,11 +44,11 @@ def test_a_folder_that_cannot_be_is_refused(tmp_path, capsys):
 #: What all commands say of a number that is none, by what was given, and where
 REFUSED = {
     "must be at least 1, got": [
-        *("compare --timesteps 0", "compare --jobs nan", "compare --jobs inf", "linear_cost --episodes two"),
+        *("compare --timesteps 0", "compare --jobs nan", "compare --jobs inf", "compare --evaluations two"),
         *("cells fit_cell --every 0", "direct_mapping --updates 0.5", "direct_mapping --pairs many", "forecasts --every 0"),
     ],
     "must be a whole number of at least 0, got": [
-        *("compare --seeds -1", "linear_cost --seeds 0.5", "direct_mapping --seeds first"),
+        *("compare --seeds -1", "outside --seeds 0.5", "direct_mapping --seeds first"),
     ],
     "must lie within 1 .. 300, got": [
         *("calibrators peers --discharges 0", "calibrators mismatch --discharges 301", "pretrained --discharges 301"),

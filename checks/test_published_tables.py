@@ -8,7 +8,6 @@ import pandas as pd
 from benchmarks import (
     calibrators,
     direct_mapping,
-    linear_cost,
     published,
     speed,
     stabilisation,
@@ -37,7 +36,6 @@ def of_mapping(tables):
 
 REPORTS = {
     "direct_mapping/direct_mapping": of_mapping,
-    "linear_cost/linear_cost": partial(of_one, linear_cost.report, "linear_cost"),
     "published/published": partial(of_one, published.report, "published"),
     "published_horizons/published": partial(of_one, published.report, "published"),
     "stabilisation/stabilisation": stabilisation.report,

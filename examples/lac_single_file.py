@@ -68,8 +68,8 @@ class Actor(nn.Module):
 
 class Critic(nn.Module):
     """
-    Networks that learn the square root ``f`` of what ``L``, the discounted sum of costs, is above a floor: all levels of the
-    cost count then, from that of a crash to that of a loop at rest.
+    Networks that learn a root ``f`` of what ``L``, the discounted sum of costs, is above a floor: all levels of the cost count
+    then, from that of a crash to that of a loop at rest.
     """
 
     def __init__(self, n_inputs: int, width: int, n_critics: int):
@@ -77,6 +77,7 @@ class Critic(nn.Module):
         networks = [two_layers(n_inputs, width).append(nn.Linear(width, 1)) for _ in range(n_critics)]
         self.networks = nn.ModuleList(networks)
         self.floor = nn.Buffer(th.zeros(1))  # follows the lowest value
+        self.scale = nn.Buffer(th.zeros(1))  # follows a tenth of the mean distance from the floor
 
     def forward(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Roots of shape (critics, rows, 1). The largest one is the most careful."""
@@ -84,14 +85,20 @@ class Critic(nn.Module):
         return th.stack([network(inputs) for network in self.networks])
 
 
-def root(value: th.Tensor) -> th.Tensor:
-    """What a critic learns of a value above the floor, with its sign: a distance where the value is like a square."""
-    return value.sign() * value.abs().sqrt()
+def distance(f: th.Tensor, scale: th.Tensor) -> th.Tensor:
+    """The square root of the value above the floor, with its sign: like a norm where the value is like a square."""
+    return f * f.abs() / (scale + f.abs()).clamp(min=1e-38)
 
 
-def square(f: th.Tensor) -> th.Tensor:
+def value(f: th.Tensor, scale: th.Tensor) -> th.Tensor:
     """The value above the floor."""
-    return f * f.abs()
+    return distance(f, scale) * distance(f, scale).abs()
+
+
+def root(above: th.Tensor, scale: th.Tensor) -> th.Tensor:
+    """What a critic learns of a value above the floor: a square root where it is large, and a fourth root near the floor."""
+    size = above.abs().sqrt()
+    return above.sign() * (size + (size * (size + 4.0 * scale)).sqrt()) / 2.0
 
 
 class LAC:
@@ -115,22 +122,27 @@ class LAC:
         with th.no_grad():
             next_actions = self.actor(batch.next_observations)
             next_roots = self.critic_target(batch.next_observations, next_actions).amax(dim=0)
-            next_values = (square(next_roots) + self.critic_target.floor).clamp(min=0.0)
+            next_values = (value(next_roots, self.critic_target.scale) + self.critic_target.floor).clamp(min=0.0)
             targets = batch.costs + settings.gamma * (1.0 - batch.terminated) * next_values
             self.critic.floor.lerp_(targets.min(), settings.tau)
-            target_roots = root(targets - self.critic.floor)
+            above = targets - self.critic.floor
+            first = self.critic.scale == 0.0
+            self.critic.scale.lerp_(0.1 * above.abs().sqrt().mean(), 1.0 if first else settings.tau)
+            scale = self.critic.scale
+            target_roots = root(above, scale)
         roots = self.critic(batch.observations, batch.actions)
         critic_loss = 0.5 * (roots - target_roots).square().mean(dim=1).sum()
 
         # 2. By how much the decrease condition L(s', a') <= L(s, a) - alpha3 c is violated, where the episode goes on
         with th.no_grad():
             next_root = self.critic(batch.next_observations, next_actions).amax(dim=0)
-            allowed = square(roots.amax(dim=0)) - settings.alpha3 * batch.costs
+            allowed = root(value(roots.amax(dim=0), scale) - settings.alpha3 * batch.costs, scale)
+            difference = distance(next_root, scale) - distance(allowed, scale)
             going_on = 1.0 - batch.terminated
-            violation = (going_on * (next_root - root(allowed))).sum() / going_on.sum().clamp(min=1.0)
+            violation = (going_on * difference).sum() / going_on.sum().clamp(min=1.0)
 
-        # 3. The actor lowers the root, and keeps its entropy
-        objective = self.critic(batch.observations, actions_pi).amax(dim=0).mean()
+        # 3. The actor lowers the distance, and keeps its entropy
+        objective = distance(self.critic(batch.observations, actions_pi).amax(dim=0), scale).mean()
         lambda_, ent_coef = self.log_lambda.detach().exp(), self.log_ent_coef.detach().exp()
         actor_loss = lambda_ * objective + ent_coef * log_prob.mean()
 
@@ -148,6 +160,7 @@ class LAC:
             # 5. The target critic follows, and its floor too
             for name, tensor in self.critic_target.state_dict().items():
                 tensor.lerp_(self.critic.state_dict()[name], settings.tau)
+            self.critic_target.scale.copy_(self.critic.scale)
         return {name: loss.item() for name, loss in losses.items()}
 
 

@@ -21,10 +21,10 @@ class LAC(CostAlgorithm):
     This implementation uses the SB3 SAC implementation as base.
     Paper: https://arxiv.org/abs/2004.14288
 
-    LAC differs from the published algorithm, ``PublishedLAC``. Two critics learn the square root of the difference between
-    ``L`` and its lowest value, so that small costs count next to large costs; the published critic learns ``L`` itself, as a
-    sum of squares. The actor minimises this root in the sampled states; the published actor minimises the condition on ``L``
-    in the next states. Targets use the mean action of the actor; published targets use sampled actions of a target actor.
+    LAC differs from the published algorithm, ``PublishedLAC``. Two critics learn a root of the difference between ``L`` and its
+    lowest value, so that small costs count next to large costs; the published critic learns ``L`` itself, as a sum of squares.
+    The actor minimises the square root of ``L`` in the sampled states; the published actor minimises the condition on ``L`` in
+    the next states. Targets use the mean action of the actor; published targets use sampled actions of a target actor.
 
     .. code-block:: python
 
@@ -36,7 +36,7 @@ class LAC(CostAlgorithm):
 
     Give costs as they are, ``reward = -cost``, and give a failure its price. Choose the discount, the learning rate and the
     number of steps; leave ``alpha3``, the multipliers and ``ent_coef`` at their defaults. LAC underestimates rare, large
-    costs: use SAC. If a loop has to settle near its goal on a known plant, try ``policy_kwargs=dict(root=4)``.
+    costs: use SAC.
 
     The critic ``L(s, a) >= 0`` is the discounted sum of costs. ``L`` has to decrease by ``alpha3`` times the cost in each
     step. The Lagrange multiplier ``lambda`` weighs this condition, and ``ent_coef`` keeps the entropy up as in SAC.
@@ -229,8 +229,8 @@ class LAC(CostAlgorithm):
         # Compute critic loss, with the current root of each critic network
         # using action from the replay buffer (all values are relative to the offset)
         target_values = self._target_values(replay_data, next_actions)
-        # The floor follows the lowest value as the target critic follows the critic
-        self.critic.floor.lerp_(target_values.min(), self.tau)
+        # The metric follows the values as the target critic follows the critic
+        self.critic.follow(target_values, self.tau)
         target_roots = self.critic.root(target_values)
         current_roots = self.critic.outputs(replay_data.observations, replay_data.actions)
         critic_loss = 0.5 * sum(F.mse_loss(current_root, target_roots) for current_root in current_roots)
@@ -274,6 +274,7 @@ class LAC(CostAlgorithm):
         if update_targets:
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
             self.critic_target.floor.lerp_(self.critic.floor, self.tau)
+            self.critic_target.scale.copy_(self.critic.scale)
             # Copy running stats, see GH issue #996
             polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 

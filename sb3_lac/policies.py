@@ -17,6 +17,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
+# Where the root passes from a fourth to a square one, in parts of the mean distance
+_SCALE = 0.1
+
 
 def largest_value(values: Sequence[th.Tensor]) -> th.Tensor:
     """The conservative one of several critics."""
@@ -139,11 +142,14 @@ class LyapunovCritic(BaseModel):
 class RootCritic(LyapunovCritic):
     """
     Lyapunov critic of ``LAC``: each network learns a root ``f(s, a)`` of the difference between ``L`` and its floor, about the
-    value of the settled loop: ``L = offset + floor + sign(f) |f|^root``.
+    value of the settled loop. The default is a square root for large ``L`` and a fourth root near the floor:
+    ``L = offset + floor + sign(f) d^2`` with the distance ``d = f^2 / (scale + |f|)``.
 
     Costs of a settling loop fall over orders of magnitude. At a thousand times the cost, the same relative error is a thousand
-    times larger in ``L``, 32 times in the square root, and less than six times in the fourth root. The unit of the costs is
-    only a factor of ``f``. Noise biases ``L`` low, because the root of a mean is larger than the mean of the roots.
+    times larger in ``L``, 32 times in the square root, and less than six times in the fourth root. Noise biases ``L`` low,
+    because the root of a mean is larger than the mean of the roots. For large costs, as of crashes, the mixed root has the
+    smaller bias of the square root. Where the loop rests it has the resolution of the fourth root. The scale between the two
+    follows the values, so that the unit of the costs is only a factor of ``f``.
 
     The floor follows the lowest value. If the discount is near 1, the offset of all values falls slowly while the loop
     improves, and a root without a floor would be flat where the loop rests. The critic learns a relative value, as in relative
@@ -152,27 +158,44 @@ class RootCritic(LyapunovCritic):
 
     n_outputs = 1
 
-    def __init__(self, *args: Any, root: int | None = None, **kwargs: Any):
-        if root not in (None, 2, 4):
-            raise ValueError(f"root={root} must be 2, of the square root, or 4, of the fourth root.")
+    def __init__(self, *args: Any, root: int | str = "mixed", **kwargs: Any):
+        if root not in ("mixed", 2, 4):
+            raise ValueError(f"root={root!r} must be 'mixed', 2 (the square root everywhere) or 4 (the fourth root).")
         super().__init__(*args, **kwargs)
-        self._stated_root = root
-        self.degree = 2 if root is None else root
-        # What all values have in common. Set by the algorithm, saved with the weights
+        self.degree = None if root == "mixed" else int(root)
+        self._degree_of_old_weights = self.degree or 4
+        # What all values have in common, and where roots pass from the fourth to the square one. Set by the algorithm, saved
+        # with the weights
         self.floor: th.Tensor
+        self.scale: th.Tensor
         self.register_buffer("floor", th.zeros(1))
+        self.register_buffer("scale", th.zeros(1))
 
     def get_extra_state(self) -> th.Tensor:
-        """Weights are of one root, which goes with them into files."""
-        return th.tensor(self.degree)
+        """Weights are of one root, which goes with them into files; 0 stands for the mixed one."""
+        return th.tensor(self.degree or 0)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        self.degree = int(state)
+        self.degree = int(state) or None
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         # Weights of before sb3_lac 0.7 go with no root: that of the arguments, which came later, or else the fourth
-        state_dict.setdefault(f"{prefix}_extra_state", th.tensor(self._stated_root or 4))
+        state_dict.setdefault(f"{prefix}_extra_state", th.tensor(self._degree_of_old_weights))
+        # One root everywhere has no scale
+        state_dict.setdefault(f"{prefix}scale", th.zeros(1))
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def follow(self, values: th.Tensor, rate: float) -> None:
+        """
+        Let the floor follow the lowest value, and the scale a tenth of the mean distance from the floor.
+
+        :param values: Values relative to the offset, of a batch
+        :param rate: Share of the way in one update; the first scale is taken as it is
+        """
+        self.floor.lerp_(values.min(), rate)
+        if self.degree is None:
+            scale = _SCALE * (values - self.floor).abs().sqrt().mean()
+            self.scale.copy_(th.where(self.scale == 0, scale, self.scale.lerp(scale, rate)))
 
     def root(self, values: th.Tensor) -> th.Tensor:
         """
@@ -182,7 +205,10 @@ class RootCritic(LyapunovCritic):
         :return: As many roots of what the values are above the floor, negative below it
         """
         above = values - self.floor
-        return above.sign() * above.abs().pow(1 / self.degree)
+        if self.degree is not None:
+            return above.sign() * above.abs().pow(1 / self.degree)
+        distances = above.abs().sqrt()
+        return above.sign() * (distances + (distances * (distances + 4 * self.scale)).sqrt()) / 2
 
     def value(self, roots: th.Tensor) -> th.Tensor:
         """
@@ -191,7 +217,7 @@ class RootCritic(LyapunovCritic):
         :param roots: What the networks learn
         :return: As many values relative to the offset, the inverse of ``root()``
         """
-        return signed_power(roots, self.degree) + self.floor
+        return signed_power(self.distance(roots), 2) + self.floor
 
     def distance(self, roots: th.Tensor) -> th.Tensor:
         """
@@ -200,7 +226,9 @@ class RootCritic(LyapunovCritic):
         :param roots: What the networks learn
         :return: As many square roots of what the values are above the floor, negative below it
         """
-        return signed_power(roots, self.degree // 2)
+        if self.degree is not None:
+            return signed_power(roots, self.degree // 2)
+        return signed_power(roots, 2) / (self.scale + roots.abs()).clamp(min=th.finfo(roots.dtype).tiny)
 
     def lyapunov_of(self, output: th.Tensor) -> th.Tensor:
         return (self.value(output) + self.offset).clamp(min=0.0)
@@ -221,8 +249,8 @@ class LyapunovPolicy(SACPolicy):
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule (could be constant)
     :param net_arch: The specification of the policy and Lyapunov networks.
-    :param root: Root of ``L`` that the critics learn, 2 (the default) or 4. The fourth root weighs small costs more; the
-        square root has less bias if costs depend on noise or on unobserved variables.
+    :param root: Root of ``L`` that the critics learn. 'mixed' (the default) is the square root for large ``L`` and the fourth
+        root near its floor; 2 or 4 is one of them everywhere.
     :param kwargs: The other arguments of ``SACPolicy``: ``activation_fn``, ``use_sde``, ``log_std_init``, ``use_expln``,
         ``clip_mean``, ``features_extractor_class``, ``features_extractor_kwargs``, ``normalize_images``, ``optimizer_class``,
         ``optimizer_kwargs`` (Adam is the fused one, unless they have ``fused``, ``foreach`` or ``differentiable``),
@@ -241,7 +269,7 @@ class LyapunovPolicy(SACPolicy):
         action_space: spaces.Box,
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
-        root: int | None = None,
+        root: int | str | None = None,
         **kwargs: Any,
     ):
         self.root = root

@@ -30,9 +30,15 @@ def test_ranges_hold_what_policies_are_tried_with_and_the_plant_as_it_is_known_a
 def test_all_algorithms_have_the_setting_of_lac_and_the_same_plant():
     of_all = [changing_plant.run_of("CartPoleCost-v0", name, 1, last_actions=2) for name in changing_plant.ALGORITHMS]
     assert all(run.environment == of_all[0].environment for run in of_all)
-    assert [run.algorithm.removesuffix(", 2 last actions") for run in of_all] == ["LAC", "LAC (root=2)", "SAC", "TQC"]
-    assert [run.settings for run in of_all] == [runs.setting_of_lac(root) for root in (4, 2, None, None)]
-    assert [run.settings["policy_kwargs"].partition("root")[2] for run in of_all] == ["=4)", "=2)", "", ""]
+    assert [run.algorithm.removesuffix(", 2 last actions") for run in of_all] == [
+        "LAC",
+        "LAC (root=2)",
+        "LAC (root=4)",
+        "SAC",
+        "TQC",
+    ]
+    assert [run.settings for run in of_all] == [runs.setting_of_lac(root) for root in (None, 2, 4, None, None)]
+    assert [run.settings["policy_kwargs"].partition("root")[2] for run in of_all] == ["", "=2)", "=4)", "", ""]
     env = of_all[0].environments()
     assert env.observation_space.shape == (6,) and "action_delay" in of_all[0].environment["drawn"]
     env.close()

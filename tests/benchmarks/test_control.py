@@ -13,11 +13,10 @@ from gymnasium import spaces
 
 pytest.importorskip("rl_zoo3")
 
-from benchmarks import control, linear_cost, stabilisation
+from benchmarks import control, stabilisation
 from benchmarks.runs import setting_of_lac
 from docs.environment_pages import DOCS, environment_page
 from sb3_lac import LAC
-from sb3_lac.envs import LinearCostEnv
 from sb3_lac.stability import fitting
 from tests.policies import Always
 from tests.sweeps import sweep
@@ -191,73 +190,3 @@ def test_all_algorithms_have_the_same_budget():
             assert "net_arch=[64, 64]" in recipe.hyperparameters["policy_kwargs"]
             if name.endswith("_common"):
                 assert setting_of_lac(root=None).items() <= recipe.hyperparameters.items()
-
-
-@pytest.fixture
-def exact_model(monkeypatch):
-    """LAC with the optimal policy and its cost-to-go, in place of training."""
-    env = LinearCostEnv()
-
-    def train_or_load(recipe, folder):
-        model = LAC("MlpPolicy", recipe.env_id, gamma=0.95, device="cpu", buffer_size=10, policy_kwargs={"net_arch": [8]})
-        gain = env.optimal_gain(model.gamma)
-
-        def predict(observations, deterministic):
-            return (-observations @ gain.T / env.control_max).astype(np.float32), None
-
-        def predict_lyapunov(observations, actions):
-            return env.cost_to_go(observations, env.control_max * actions, gain, model.gamma)
-
-        monkeypatch.setattr(model, "predict", predict)
-        monkeypatch.setattr(model.policy, "predict_lyapunov", predict_lyapunov)
-        return model
-
-    monkeypatch.setattr(linear_cost, "train_or_load", train_or_load)
-
-
-def test_the_exact_solution_is_recognized_and_written(tmp_path, exact_model, capsys):
-    linear_cost.main(["--seeds", "1", "4", "--timesteps", "5000", "--episodes", "20", "--jobs", "1", "--out", str(tmp_path)])
-    table, values = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("linear_cost", "values"))
-    assert table["seed"].tolist() == [1, 4] and table.notna().all(axis=None)
-    row = table.iloc[1]
-    assert set(values["seed"]) == {1, 4} and len(values) == 2 * 20 * 100
-    for name in ("position", "velocity"):
-        assert row[f"gain_{name}"] == pytest.approx(row[f"gain_{name}_exact"], rel=1e-5)
-    assert row["linear_over_optimum"] == pytest.approx(1.0, abs=1e-9)
-    for end in ("", "_low", "_high"):
-        assert row[f"discounted_over_optimum{end}"] == pytest.approx(1.0, abs=1e-6)
-    # the best gain of the discounted cost is not that of the mean over an episode
-    assert 1.0 < row["per_step_over_optimum"] < 1.05
-    assert (row["value_slope"], row["value_intercept"], row["value_correlation"]) == pytest.approx((1, 0, 1), abs=1e-4)
-    assert row["calibration_slope"] == pytest.approx(1.0, abs=0.02)
-    assert row["alpha3_exact"] == pytest.approx(row["alpha3_optimum"], rel=1e-5)
-    assert row["alpha3_low"] < row["alpha3_exact"] < row["alpha3_high"]
-    np.testing.assert_allclose(values["learned"], values["exact"], rtol=1e-3)
-    text = (tmp_path / "linear_cost.md").read_text(encoding="utf-8")
-    assert text in capsys.readouterr().out and "| 1.000, 1.000 to 1.000 " in text and "| 1.0000 " in text
-
-
-def test_what_noise_costs_is_the_value_of_the_goal():
-    env, gamma = LinearCostEnv(), 0.9
-    gain = env.optimal_gain(gamma)
-    value = env.cost_to_go(np.zeros((1, 2)), np.zeros((1, 1)), gain, gamma)
-    assert linear_cost.noise_cost(gain, gamma) == pytest.approx(value[0])
-
-
-def test_what_a_policy_costs_too_much_is_seen_in_roll_outs():
-    env = LinearCostEnv()
-    gain = env.optimal_gain(0.95) / env.control_max
-    # an action that is off by a constant: no linear policy close to it shows that
-
-    class Biased(linear_cost.LinearPolicy):
-        def predict(self, *arguments, **named):
-            actions, state = super().predict(*arguments, **named)
-            return actions + 0.1, state
-
-    optimal, biased = (linear_cost.episode_costs(policy(gain), 40) for policy in (linear_cost.LinearPolicy, Biased))
-    assert optimal.shape == (100, 40)
-    discounted, per_step = (linear_cost.over_optimum(biased, optimal, gamma) for gamma in (0.95, 1.0))
-    for ratio, low, high in (discounted, per_step):
-        assert 1.0 < low < ratio < high < 10.0
-    # the same episodes are paired: their starts do not widen the interval
-    assert linear_cost.over_optimum(2 * optimal, optimal, 0.95) == pytest.approx((2.0, 2.0, 2.0))

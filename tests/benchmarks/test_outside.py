@@ -63,7 +63,7 @@ def test_the_study_trains_writes_and_goes_on(tmp_path, monkeypatch, capsys):
     assert done[["algorithm", "seed"]].to_numpy().tolist() == [["lac", 1], ["sac", 1], ["lac", 2], ["sac", 2]]
     assert [json.loads(each)["settings"] for each in done["configuration"][:2]] == [{}, {"learning_rate": 1e-3}]
     assert outside.run_of("Hopper-v5", "sac", 1).timesteps == 20_000
-    assert done[outside.RETURN].between(-2000, -500).all()
+    assert done[outside.AT_THE_END].between(-2000, -500).all()
     text = (out / "outside.md").read_text()
     assert "| Pendulum-v1 | 40" in text and "nan" not in text and text in capsys.readouterr().out
     assert (out / "learning.png").stat().st_size > 1000 and len(pd.read_csv(out / "comparison.csv")) == 1

@@ -150,21 +150,41 @@ def test_fused_optimizer_updates_layers_of_any_memory_layout(make_model, make_en
                 assert parameter.grad is None and (parameter == 1).all()
 
 
-def test_the_root_is_kept_in_files_and_is_one_of_lac_alone(make_model, tmp_path):
-    model = make_model(n_collect=0)
+@pytest.mark.parametrize("root", ["mixed", 2, 4])
+def test_the_root_and_its_scale_are_kept_in_files(root, make_model, tmp_path):
+    model = make_model(policy_kwargs={"root": root})
+    values = th.tensor([[-1.0], [0.0], [1e-6], [9.0], [300.0]]) + model.critic.floor
     model.policy.save(tmp_path / "policy.zip")
-    values = th.tensor([[-1.0], [0.0], [9.0]])
-    for critic in (model.critic, model.critic_target, LyapunovPolicy.load(tmp_path / "policy.zip").critic):
-        assert critic.root(values).flatten().tolist() == [-1.0, 0.0, 3.0]
-        assert th.equal(critic.value(critic.root(values)), values) and th.equal(critic.distance(values), values)
-    with pytest.raises(ValueError, match="root=3 must be 2, of the square root, or 4"):
+    model.save(tmp_path / "model")
+    for critic in (LyapunovPolicy.load(tmp_path / "policy.zip").critic, LAC.load(tmp_path / "model").critic):
+        assert critic.degree == model.critic.degree and th.equal(critic.root(values), model.critic.root(values))
+        th.testing.assert_close(critic.value(critic.root(values)), values)
+        distances = [-1.0, 0.0, 1e-3, 3.0, 300**0.5]
+        assert critic.distance(critic.root(values)).flatten().tolist() == pytest.approx(distances, rel=2e-2, abs=1e-6)
+
+
+def test_the_default_root_is_a_fourth_near_the_floor_and_a_square_one_far_above_and_knows_no_unit(make_model):
+    critic = make_model(n_collect=0).critic
+    costs = th.linspace(0.0, 10.0, 256)[:, None]
+    critic.follow(costs, 0.005)
+    near, far = (th.tensor([[1.0], [16.0]]) * size for size in (1e-12, 1e12))
+    for values, power in ((near, 2.0), (far, 4.0)):
+        low, high = critic.root(values).flatten().tolist()
+        assert high / low == pytest.approx(power, rel=1e-2)
+    roots = critic.root(costs)
+    other = make_model(n_collect=0).critic
+    other.follow(100 * costs, 0.005)
+    th.testing.assert_close(other.root(100 * costs), 10 * roots)
+
+
+def test_one_that_is_no_root_is_refused_and_roots_are_of_lac_alone(make_model):
+    with pytest.raises(ValueError, match=r"root=3 must be 'mixed', 2 .* or 4"):
         make_model(policy_kwargs={"root": 3})
     with pytest.raises(TypeError, match="root"):
         make_model(algorithm=PublishedLAC, policy_kwargs={"root": 2})
+    model = make_model(n_collect=0)
     alone = MlpPolicy(model.observation_space, model.action_space, lambda _: 1e-3)
-    assert alone.critic.degree == model.critic.degree
-    model.save(tmp_path / "model")
-    assert LAC.load(tmp_path / "model").critic.degree == 2
+    assert alone.critic.degree is model.critic.degree is None
 
 
 @pytest.mark.parametrize(("stated", "root"), [({}, 4), ({"root": None}, 4), ({"root": 2}, 2), ({"root": 4}, 4)])

@@ -129,6 +129,7 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
         assert {name for name, _ in module.named_parameters()} == set(module.state_dict()) - {
             "offset",
             "floor",
+            "scale",
             "_extra_state",
         }
         optimized = [parameter for group in module.optimizer.param_groups for parameter in group["params"]]

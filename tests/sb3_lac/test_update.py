@@ -1,6 +1,7 @@
 """One update of LAC, written out a second time from the equations and compared with ``train()``."""
 
 import math
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -31,13 +32,22 @@ def roots_of(weights, obs, actions, n_critics):
     return th.stack(outputs)
 
 
-def root(value, degree=2):
-    return th.sign(value) * abs(value) ** (1 / degree)
+def square_root(value):
+    return th.sign(value) * abs(value) ** 0.5
 
 
-def relative(roots, degree):
+def root(value, degree, scale):
+    """What critics learn: of the default the positive solution f of f^2 = d (scale + f), d being the square root."""
+    if degree is not None:
+        return th.sign(value) * abs(value) ** (1 / degree)
+    d = abs(value) ** 0.5
+    return th.sign(value) * (0.5 * d + (0.25 * d**2 + scale * d) ** 0.5)
+
+
+def relative(roots, degree, scale):
     """L of the largest of several critics, above its floor."""
-    return th.sign(roots.amax(dim=0)) * abs(roots.amax(dim=0)) ** degree
+    f = roots.amax(dim=0)
+    return th.sign(f) * (abs(f) ** degree if degree is not None else (f**2 / (scale + abs(f))) ** 2)
 
 
 class ScalarAdam:
@@ -65,14 +75,17 @@ def test_the_value_behind_each_sample_is_discounted_as_it_says_and_not_negative(
     monkeypatch.setattr(model.critic_target, "value", lambda roots: roots + next_value)
     roots = model.critic.outputs(batch.observations, batch.actions)
     values = (1 - batch.dones) * batch.discounts * max(next_value, 0.0) - batch.rewards
-    model.critic.floor.copy_(floor := (1 - model.tau) * model.critic.floor + model.tau * values.min())
-    targets = model.critic.root(values)
-    model.critic.floor.copy_((floor - model.tau * values.min()) / (1 - model.tau))
+    after = deepcopy(model.critic)
+    after.follow(values, model.tau)
+    targets = after.root(values)
     expected = 0.5 * sum(((root - targets) ** 2).mean() for root in roots)
     assert train_metrics(model)["critic_loss"] == pytest.approx(expected.item(), rel=1e-4)
 
 
-@pytest.mark.parametrize(("n_critics", "bound", "degree"), [(1, 0.0, 2), (2, 0.0, 2), (1, 3.0, 2), (2, 3.0, 2), (2, 3.0, 4)])
+@pytest.mark.parametrize(
+    ("n_critics", "bound", "degree"),
+    [(1, 0.0, None), (2, 0.0, None), (1, 3.0, None), (2, 3.0, None), (2, 3.0, 2), (2, 3.0, 4)],
+)
 def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics, bound, degree):
     # With plain gradient descent, a wrong factor in a loss cannot hide (Adam is invariant to scale)
     policy_kwargs = {"optimizer_class": th.optim.SGD, "n_critics": n_critics, "root": degree}
@@ -95,7 +108,7 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
     obs, next_obs, actions = batch.observations, batch.next_observations, batch.actions
     costs, dones = bound - batch.rewards.flatten(), batch.dones.flatten()
     # After a termination nothing is paid, which costs the bound in every step
-    offset, floor, target_floor = bound / (1 - GAMMA), 0.0, 0.0
+    offset, floor, target_floor, scale = bound / (1 - GAMMA), 0.0, 0.0, 0.0
 
     for step in range(4):
         th.manual_seed(step)
@@ -106,20 +119,23 @@ def test_train_is_the_update_of_the_equations(make_model_without_env, n_critics,
         actions_pi, log_prob = policy_sample(actor, obs)
         with th.no_grad():
             next_actions = mean_action(actor, next_obs)
-            next_values = relative(roots_of(critic_target, next_obs, next_actions, n_critics), degree) + target_floor
+            next_values = relative(roots_of(critic_target, next_obs, next_actions, n_critics), degree, scale) + target_floor
             next_values = th.maximum(next_values, -th.tensor(offset))
             # y - offset, where bound + GAMMA * offset is the offset
             y = costs - bound + GAMMA * (1 - dones) * next_values
             floor = (1 - TAU) * floor + TAU * y.min()
             target_floor = (1 - TAU) * target_floor + TAU * floor
+            new_scale = 0.1 * ((y - floor).abs() ** 0.5).mean().item()
+            scale = new_scale if step == 0 else (1 - TAU) * scale + TAU * new_scale
         roots = roots_of(critic, obs, actions, n_critics)
-        critic_loss = (0.5 * (roots - root(y - floor, degree)) ** 2).mean(dim=1).sum()
-        values = (relative(roots, degree) + floor + offset).clamp(min=0).detach()
+        critic_loss = (0.5 * (roots - root(y - floor, degree, scale)) ** 2).mean(dim=1).sum()
+        values = (relative(roots, degree, scale) + floor + offset).clamp(min=0).detach()
         next_roots = roots_of(critic, next_obs, next_actions, n_critics)
-        difference = root(relative(next_roots, degree)) - root(relative(roots.detach(), degree) - ALPHA3 * costs)
+        allowed = relative(roots.detach(), degree, scale) - ALPHA3 * costs
+        difference = square_root(relative(next_roots, degree, scale)) - square_root(allowed)
         # Where the episode goes on
         d = difference[dones == 0].mean()
-        objective = root(relative(roots_of(critic, obs, actions_pi, n_critics), degree)).mean()
+        objective = square_root(relative(roots_of(critic, obs, actions_pi, n_critics), degree, scale)).mean()
         lambda_, beta = math.exp(log_lambda.value), math.exp(log_beta.value)
         actor_loss = lambda_ * objective + beta * log_prob.mean()
         violation = log_prob.mean().item() - 2.0  # target entropy: minus the number of actions
@@ -281,7 +297,7 @@ def test_target_update_interval_counts_the_updates_of_all_calls(make_model):
     followed = []
     for gradient_steps in (1, 1, 2, 3, 1):
         model.train(gradient_steps=gradient_steps, batch_size=16)
-        pairs = [(model.critic.floor, model.critic_target.floor)]
+        pairs = [(getattr(model.critic, name), getattr(model.critic_target, name)) for name in ("floor", "scale")]
         pairs += zip(model.critic.parameters(), model.critic_target.parameters(), strict=True)
         followed.append(all(th.equal(*pair) for pair in pairs))
     # After updates 1, 2, 4, 7 and 8: the first, fourth and seventh are followed
