@@ -24,7 +24,8 @@ class LAC(CostAlgorithm):
     LAC differs from the published algorithm, ``PublishedLAC``. Two critics learn a root of the difference between ``L`` and
     its lowest value, so that small costs count next to large costs; the published critic learns ``L`` itself, as a sum of
     squares. The actor minimises the square root of ``L`` in the sampled states; the published actor minimises the condition on
-    ``L`` in the next states. Targets use the mean action of the actor; published targets use sampled actions of a second actor.
+    ``L`` in the next states. Targets use the mean action of the actor; published targets use actions sampled from a target
+    actor.
 
     .. code-block:: python
 
