@@ -141,11 +141,11 @@ def calibrated(
     :param end_is_asked: whether an end that cannot be told is an error, and not only unknown
     """
     is_whole = not np.isnan(discharge.eod_time_s(settings.resolved.cut_off_V))
-    known = settings if is_whole else settings.with_nominal_prior()
+    known, usual_C = (settings, None) if is_whole else (settings.with_nominal_cell(), settings.usual_q_mobile_C)
     part = _look_at(discharge, known)
     if end_is_asked and _is_below_all_sizes(part):
         raise ValueError(_below_all_sizes())
-    estimate, method, model, now = _estimate(part, known, load)
+    estimate, method, model, now = _estimate(part, known, load, usual_C)
     # a cell in progress has not ended, however low its model comes in the pulses before
     cut_off_V, current_A = (-np.inf, 0.0) if part.in_progress else (settings.resolved.cut_off_V, part.load.mean_A)
     shown = model.forecast(part.record, estimate, cut_off_V, current_A)
@@ -228,13 +228,11 @@ def _is_running(part: _LoadedPart) -> bool:
 
 
 def _estimate(
-    part: _LoadedPart, settings: Settings, load: LoadToCome | None
+    part: _LoadedPart, settings: Settings, load: LoadToCome | None, usual_q_mobile_C: float | None
 ) -> tuple[Estimate, Method, RecordModel, ModelNow | None]:
     """The estimate, the method, the model that it is of, and of the filter where this stands at the end of the record."""
-    is_running, is_new = _is_running(part), settings.prior_q_mobile_C is None and settings.cell is None
-    # before the knee least squares, of which all parameters are free then, take any large q_mobile for likely
-    method = settings.method or ("kalman" if is_running and is_new else "least-squares")
-    calibrator = replace(settings, method=method).calibrator(part.cell, part.start)
+    is_running, method = _is_running(part), settings.method or "least-squares"
+    calibrator = replace(settings, method=method).calibrator(part.cell, part.start, usual_q_mobile_C)
     cell, thermal, now = part.cell, settings.resolved.thermal, None
     if _is_below_all_sizes(part):
         estimate = _SMALLEST
@@ -326,8 +324,8 @@ def _notes(part: _LoadedPart, estimate: Estimate, settings: Settings, shown: Vol
         yield other_load
     if float(part.discharge.time_s[-1]) > seen_s:
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
-    if settings.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
-        yield "The filter expects a cell of some 2 Ah: of another one give the nominal capacity, the life, q_max or constants."
+    if settings.usual_q_mobile_C is not None and settings.nominal_Ah is None and settings.method != "policy":
+        yield "A cell of some 2 Ah is expected: of another one give the nominal capacity, the life, q_max or constants."
     if rmse_V > settings.resolved.mismatch_V:
         text = f"The model misses the voltage by {1e3 * rmse_V:.0f} mV (RMSE), more than mismatch_V."
         yield f"{text} Other loads make the interval too narrow."

@@ -117,18 +117,14 @@ def test_nothing_is_fitted_to_bad_input_and_nothing_is_overwritten(
     assert Path("old.json").read_text() == Path("old_fit.png").read_text() == "precious"
 
 
-def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(recorded, tmp_path, terminal):
+def test_what_remains_of_a_discharge_in_progress_is_wide_without_a_prior(recorded, tmp_path, terminal):
     path = write(recorded.until(1500.0), tmp_path / "half.csv")
     shown = terminal.shows(path, status=3)
     assert "remaining" in shown and "Not settled: q_max is not known to 2 % yet" in shown
-    assert (
-        "battery-calibrate forecast FILE --life" in shown
-        and "calibrated by the Kalman filter" in shown
-        and "Ah   so far" in shown
-    )
-    assert terminal.row(path, status=3) == terminal.row(path, "--method", "kalman", status=3)
+    assert "battery-calibrate forecast FILE --life" in shown and "Ah   so far" in shown
+    alone = terminal.row(path, status=3)
     shown = terminal.shows(path, "--prior", 5460, 55, "--nominal", 2, "--out", tmp_path, status=3)
-    assert "Not settled: q_max rests on its prior" in shown and "--life" not in shown and "Kalman" not in shown
+    assert "Not settled: q_max rests on its prior" in shown and "--life" not in shown
     assert "2.01 A to go on" in shown and "Ah), predicted, of 2 Ah" in shown
     (row,) = pd.read_csv(tmp_path / "estimate.csv").to_dict(orient="records")
     end_s, whole_Ah = recorded.eod_time_s(2.7), recorded.loaded_part(2.7).charge_C / 3600.0
@@ -139,28 +135,30 @@ def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(rec
     # which the moment of load-on widens a little
     by_end = row["sd_predicted_eod_time_s"] * row["future_current_A"] / 7200.0
     assert by_end < row["sd_state_of_health"] < 1.01 * by_end
-    filtered = terminal.row(path, "--method", "kalman", status=3)
-    assert filtered["settled"] is False and filtered["measured_eod_time_s"] is None
-    assert 1500.0 + filtered["remaining_s"] == pytest.approx(end_s, rel=0.2)
+    assert alone["settled"] is False and alone["measured_eod_time_s"] is None
+    assert 1500.0 + alone["remaining_s"] == pytest.approx(end_s, rel=0.2)
+    assert alone["sd_predicted_eod_time_s"] > 5.0 * row["sd_predicted_eod_time_s"]
 
 
-def test_the_record_chooses_the_method_and_not_what_comes_out(recorded):
+def test_what_is_usual_of_its_size_counts_in_progress_alone_and_where_nothing_is_known(recorded, monkeypatch):
+    told, calibrator = [], Settings.calibrator
+    monkeypatch.setattr(Settings, "calibrator", lambda *given: told.append(given[-1]) or calibrator(*given))
     running, whole = recorded.until(1500.0), recorded.loaded_part(2.7)
     rest = [running.time_s[-1] + 60.0 * np.arange(1.0, 5.0), np.linspace(3.7, 3.8, 4), np.zeros(4)]
     columns = (running.time_s, running.voltage_V, running.current_A)
     paused = Discharge(*map(np.append, columns, rest))
     pulses = simulate(np.where(np.arange(1600) % 200 < 100, 4.0, 1.0), 7000.0, 0.12, load_unit="current", thermal=True)
-    for record, options, method in (
-        (running, {}, "kalman"),
-        (running, {"nominal_Ah": 2.0}, "kalman"),
-        (running, {"prior_q_mobile_C": (5460.0, 55.0)}, "least-squares"),
-        (running, {"cell": NEW_CELL}, "least-squares"),
-        (paused, {}, "least-squares"),
-        (seen(pulses, slice(None)), {}, "kalman"),
-        (whole, {}, "least-squares"),
-        (whole, {"method": "kalman"}, "kalman"),
+    for record, options, counts in (
+        (running, {}, True),
+        (running, {"nominal_Ah": 2.0}, True),
+        (running, {"prior_q_mobile_C": (5460.0, 55.0)}, False),
+        (running, {"cell": NEW_CELL}, False),
+        (paused, {}, True),
+        (seen(pulses, slice(None)), {}, True),
+        (whole, {}, False),
     ):
-        assert battery_env.calibrate(record, **options).method == method, (method, options)
+        assert battery_env.calibrate(record, **options).method == "least-squares"
+        assert (told[-1] is not None) == counts, options
 
 
 def test_a_cell_of_more_than_twice_the_size_is_settled_at_1C_and_one_number_alone_at_C_over_30():
