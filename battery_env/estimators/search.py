@@ -259,7 +259,7 @@ class Search:
             q_mobile, r_o = candidate, cell.r_o
             if "q_mobile" in self.parameters:
                 low_C, high_C = self.bounds["q_mobile"]
-                q_mobile = _within(q_mobile, (max(low_C, (1.0 + _START_EXCESS[0]) * self.least_q_C), high_C))
+                q_mobile = _within(q_mobile, (max(low_C, (1.0 + MARGIN) * self.least_q_C), high_C))
             model_V, _, by_r_o_A = self.model.sensitivities(current_A, q_mobile, r_o, stride)
             residual, by_r_o = error.whitened(np.column_stack([model_V - voltage_V, by_r_o_A])).T
             if "r_o" in self.parameters:
@@ -291,8 +291,8 @@ class Search:
         return [starts[order[n]] for n in rivals[np.argsort(squares[rivals], kind="stable")]]
 
     def best(self, starts: Sequence[dict[str, float]], priors: Sequence[AnyPrior]) -> Fit:
-        """Return the best fit that is found from any of the starts."""
-        return min((self._fit(start, priors) for start in starts), key=lambda fit: fit.square)
+        """Return the best fit that is found from any of the starts; one without an ``r_o`` is empty on the coarse grid."""
+        return min((self._fit(start, priors) for start in starts if not isnan(start["r_o"])), key=lambda fit: fit.square)
 
     def _fit(self, start: dict[str, float], priors: Sequence[AnyPrior]) -> Fit:
         free, values = list(self.unknown), dict.fromkeys(self.nuisance, 0.0) | start

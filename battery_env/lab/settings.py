@@ -17,14 +17,13 @@ from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
-from battery_env.estimators.kalman.filter import ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import Reason
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import CUT_OFF_V, DischargeStart
 
-Method = Literal["least-squares", "kalman", "policy"]
+Method = Literal["least-squares", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 # What cells of some size hold, new or worn, as a share of a new one: about this much.
@@ -62,13 +61,11 @@ class ResolvedSettings(NamedTuple):
 @dataclass(frozen=True)
 class Settings:
     """
-    How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
-    ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs. What is not stated stays ``None``, so
-    that it follows another ``cell``; :attr:`resolved` has the numbers.
+    How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, with what such a cell needs.
+    What is not stated stays ``None``, so that it follows another ``cell``; :attr:`resolved` has the numbers.
 
-    :param method: of calibration; ``None``: the filter for a record in progress under load, if neither a prior nor the cell is
-        known, and else least squares. ``"policy"`` is the one that comes with the package, for both parameters; its model is a
-        new 18650 at constant temperature
+    :param method: of calibration; ``None``: least squares. ``"policy"`` is the one that comes with the package, for both
+        parameters; its model is a new 18650 at constant temperature
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: where that of the fit of ``cell`` does, or 2.7
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
     :param mismatch_V: error to expect of the model itself, V; ``None``: that of the fit of ``cell``, or 0.05
@@ -217,7 +214,7 @@ class Settings:
 
     def calibrator(
         self, cell: CellParameters | None = None, start: Start | None = None, usual_q_mobile_C: float | None = None
-    ) -> LeastSquares | ExtendedKalmanFilter | PolicyEstimator:
+    ) -> LeastSquares | PolicyEstimator:
         """
         The calibrator that is asked for. It refuses options that it cannot use.
 
@@ -240,9 +237,6 @@ class Settings:
             "q_mobile_bounds_C": self.q_mobile_bounds_C,
             "usual_start": resolved.usual_start,
         }
-        if self.method == "kalman":
-            sd_r_o_ohm = self.fit.sd_r_o_ohm if self.fit else 0.0
-            return ExtendedKalmanFilter(mismatch_V=resolved.mismatch_V, cell_sd_r_o_ohm=sd_r_o_ohm, **common)
         rates_sd = self._rates_sd()
         # constants that are anybody's, once they are free, explain as much of the error as q_mobile and r_o absorb
         is_explained = rates_sd is RATE_PRIOR_SD

@@ -235,16 +235,15 @@ def test_the_version_is_that_of_the_package(capsys):
     assert capsys.readouterr().out == f"battery_env {battery_env.__version__}\n"
 
 
-@pytest.mark.parametrize("method", ["least-squares", "kalman"])
 @pytest.mark.parametrize(
     ("first", "more", "reason"),
     [(0, {}, "starts at 3.94 V"), (400, {"initial_soc": "rest"}, "does not start with a minute at rest")],
 )
-def test_no_capacity_is_stated_where_the_cell_did_not_start_full(first, more, reason, method):
+def test_no_capacity_is_stated_where_the_cell_did_not_start_full(first, more, reason):
     load_A = np.append(np.zeros(120), np.full(3000, 2.0))
     start = initial_state(6000.0, soc=0.7)
     low = simulate(load_A, 6000.0, 0.15, load_unit="current", thermal=True, initial=start, cut_off_V=2.65)
-    found = battery_env.calibrate(seen(low, slice(first, None)), nominal_Ah=2.0, method=method, **more)
+    found = battery_env.calibrate(seen(low, slice(first, None)), nominal_Ah=2.0, **more)
     assert found.drawn_Ah > 0.9 and reason in found.reason
     assert np.isnan([found.capacity_Ah, found.predicted_capacity_Ah, found.state_of_health]).all()
     assert "Ah   to 2.7 V; not the capacity, as not all of the charge is known" in str(found)
@@ -376,8 +375,8 @@ def test_results_among_the_records_are_no_records(recorded, tmp_path, terminal):
 class TestInPython:
     def test_files_tables_and_discharges_say_the_same_as_on_the_command_line(self, recorded, tmp_path, terminal):
         path = Path(write(Samples(recorded.time_s, recorded.voltage_V, -recorded.current_A), tmp_path / "cell.csv"))
-        row = terminal.row(path, "--nominal", 2, "--method", "kalman")
-        options = {"nominal_Ah": 2.0, "method": "kalman"}
+        row = terminal.row(path, "--nominal", 2, "--method", "policy")
+        options = {"nominal_Ah": 2.0, "method": "policy"}
         (of_file,), (of_table,) = (battery_env.calibrate(each, **options) for each in (path, pd.read_csv(path)))
         of_discharge = battery_env.calibrate(battery_env.read_discharges(path)[0], Settings(**options))
         for found in (of_file, of_table, of_discharge):
@@ -412,14 +411,6 @@ def test_the_temperature_is_the_first_one_measured_or_that_of_the_surroundings(r
         for more in ({"temperature_C": temperature_C}, *({"ambient temperature": each_C} for each_C in (20.0, 40.0)))
     ]
     assert r_o_ohm[0] == pytest.approx(r_o_ohm[1], rel=1e-3) and r_o_ohm[1] > r_o_ohm[2]
-
-
-def test_the_filter_follows_the_measured_temperature_unless_it_is_held(recorded):
-    warming = replace(recorded, temperature_C=np.linspace(20.0, 40.0, len(recorded.time_s)))
-    measured, held = (
-        calibrated(warming, Settings(method="kalman", **more)).row()["r_o_ohm"] for more in ({}, {"thermal": False})
-    )
-    assert measured < held
 
 
 def test_many_samples_are_averaged_and_say_the_same(recorded):

@@ -12,8 +12,6 @@ from battery_env import NEW_CELL, Estimate, RecordModel, forecast, initial_state
 from battery_env.__main__ import calibrate
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
-from battery_env.estimates import last_estimate
-from battery_env.estimators import ExtendedKalmanFilter
 from battery_env.lab.calibrate import calibrate as calibrate_record
 from battery_env.lab.running import forecast_end, read_load
 from battery_env.lab.settings import Settings
@@ -159,17 +157,6 @@ class TestUncertainty:
         assert self.width(unsure, mismatch_V=0.05) == pytest.approx(self.width(TRUTH, mismatch_V=0.05), rel=0.1)
         # what is told of the resistance is the estimate
         assert forecast(self.record, unsure, 8.0, model=MODEL).r_o.std() == pytest.approx(error_ohm, rel=0.1)
-
-    def test_of_a_filter_the_end_is_the_one_that_it_states(self):
-        filter_ = ExtendedKalmanFilter(mismatch_V=0.02, dt_s=4.0, prior_q_mobile_C=(6050.0, 60.0))
-        estimate = last_estimate(filter_.follow(self.record))
-        assert estimate == filter_.estimate(self.record)
-        filter_.follow(self.record)
-        for load in (4.0, 2.0):
-            found, left = forecast(self.record, estimate, load, model=filter_.now(), mismatch_V=0.0), filter_.remaining(load)
-            low_s, median_s, high_s = found.eod_quantile_s() - found.now_s
-            assert median_s == pytest.approx(left.time_s, abs=0.2 * left.sd_s)
-            assert high_s - low_s == pytest.approx(3.29 * left.sd_s, rel=0.1)
 
     def test_an_offset_that_the_record_shows_goes_on(self):
         record, cut_off_V = self.record, 3.2
