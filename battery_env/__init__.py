@@ -20,7 +20,6 @@ if TYPE_CHECKING:
         CellFit,
         ClosedForm,
         Estimator,
-        ExtendedKalmanFilter,
         LeastSquares,
         cramer_rao_bound,
         fit_cell,
@@ -48,7 +47,7 @@ _MODULES = {
     "electrochemistry.aging_path": ("AgingPath",),
     "estimates": ("Estimate",),
     "estimators": (
-        *("CellFit", "ClosedForm", "Estimator", "ExtendedKalmanFilter", "LeastSquares"),
+        *("CellFit", "ClosedForm", "Estimator", "LeastSquares"),
         *("cramer_rao_bound", "fit_cell", "fit_life", "soc_from_rest"),
     ),
     "evaluation": ("evaluate",),

@@ -29,7 +29,6 @@ from matplotlib.figure import Figure
 from battery_env import (
     AgingPath,
     Estimate,
-    ExtendedKalmanFilter,
     LeastSquares,
     PolicyEstimator,
     TrajectoryDataset,
@@ -53,6 +52,7 @@ from battery_env.policies.pretrained import file_stem, write_card
 from battery_env.records import drawn
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
 from battery_env.records.model import RecordModel
+from benchmarks.kalman_filter import PlainKalmanFilter
 from benchmarks.runs import setting_of_lac
 from benchmarks.study import (
     Cell,
@@ -247,13 +247,13 @@ def _along(path: AgingPath, method: str, whole: _Whole) -> Iterator[dict[str, ob
 
 
 def _filtered(path: AgingPath, record: Discharge) -> tuple[Estimate, float]:
-    """What the filter says that expects the cells of a path, with their mean constants, and the error of that model, V."""
+    """What a plain filter says that expects the cells of a path, with their mean constants, and the error of that model, V."""
     (mean, covariance), size = path.moments, len(PATH_NAMES)
     constants = dict(zip(PATH_NAMES, mean.tolist(), strict=True))
     priors = [(float(np.exp(mean[n])), float(np.exp(mean[n]) * np.sqrt(covariance[n, n]))) for n in (size - 2, size - 1)]
     cell = cell_with(path.cell, constants)
-    found = ExtendedKalmanFilter(
-        cell=cell, prior_q_mobile_C=priors[0], prior_r_o_ohm=priors[1], mismatch_V=_MEAN_CELL_MISMATCH_V
+    found = PlainKalmanFilter(
+        cell=cell, prior_q_mobile_C=priors[0], prior_r_o_ohm=priors[1], voltage_noise_V=_MEAN_CELL_MISMATCH_V
     ).estimate(record)
     return replace(found, constants=constants), _MEAN_CELL_MISMATCH_V
 

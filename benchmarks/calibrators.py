@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS
-from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, LeastSquares
+from battery_env.estimators import ClosedForm, Estimator, LeastSquares
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
 from battery_env.parameters import PARAMETER_NAMES
@@ -38,6 +38,7 @@ from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.contests import HELD_OUT, SENSORS
+from benchmarks.kalman_filter import PlainKalmanFilter
 from benchmarks.pretrained import OPTIONS
 from benchmarks.study import (
     SYMBOLS,
@@ -197,9 +198,9 @@ def _least_squares(name: str, needs: str, **options: Any) -> Calibrator:
 
 
 def _kalman(name: str, needs: str, mismatch_V: float = 0.0, thermal: bool = False) -> Calibrator:
-    def make(unknown: Sequence[str], told_V: float | None) -> ExtendedKalmanFilter:
-        noise_V = None if told_V is None else max(told_V, mismatch_V)
-        return ExtendedKalmanFilter(unknown, thermal=thermal, voltage_noise_V=noise_V, mismatch_V=mismatch_V)
+    def make(unknown: Sequence[str], told_V: float | None) -> PlainKalmanFilter:
+        # an error of the model is noise to it
+        return PlainKalmanFilter(unknown, thermal=thermal, voltage_noise_V=max(told_V or NOISE_V, mismatch_V))
 
     return Calibrator(name, needs, make)
 

@@ -26,7 +26,7 @@ from scipy.stats import norm, spearmanr
 
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates import Estimate
-from battery_env.estimators import CellFit, Estimator, ExtendedKalmanFilter, LeastSquares, fit_cell
+from battery_env.estimators import CellFit, Estimator, LeastSquares, fit_cell
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
 from battery_env.lab.settings import Settings
 from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, new_figure, plot_cell_fit
@@ -139,10 +139,11 @@ def progress_table(progress: pd.DataFrame) -> pd.DataFrame:
     return table_of(shown, {"cell": "cell", "seen": "seen (%)", "method": "method"}, cells)
 
 
-def least_squares(prior_q_mobile_C: float | None = None) -> LeastSquares:
-    """Least squares with the constants of the new cell."""
+def least_squares(prior_q_mobile_C: float | None = None, is_size_known: bool = False) -> LeastSquares:
+    """Least squares with the constants of the new cell, and what ``calibrate`` expects of a cell in progress of its size."""
     prior = None if prior_q_mobile_C is None else (prior_q_mobile_C, PRIOR_SD_SHARE * prior_q_mobile_C)
-    calibrator = Settings(method="least-squares", prior_q_mobile_C=prior).calibrator()
+    settings = Settings(prior_q_mobile_C=prior)
+    calibrator = settings.calibrator(usual_q_mobile_C=settings.usual_q_mobile_C if is_size_known else None)
     assert isinstance(calibrator, LeastSquares)
     return calibrator
 
@@ -159,7 +160,7 @@ def life_part(cell: str) -> Tables:
         if previous_C is not None:
             methods = {
                 "least squares alone": least_squares(),
-                "Kalman filter alone": ExtendedKalmanFilter(thermal=True, mismatch_V=UNFITTED_MISMATCH_V),
+                "size known": least_squares(is_size_known=True),
                 "with prior": least_squares(previous_C),
             }
             in_progress += rows_in_progress(discharge, methods, _THERMAL, whole[-1])

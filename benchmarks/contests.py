@@ -16,7 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from battery_env.estimators import ClosedForm, Estimator, ExtendedKalmanFilter, LeastSquares
+from battery_env.estimators import ClosedForm, Estimator, LeastSquares
 from battery_env.evaluation import evaluate, summarize
 from battery_env.plotting import (
     LABELS,
@@ -31,6 +31,7 @@ from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.full_state.full_state_task import FullStateTask
 from battery_env.trajectories import TrajectoryDataset
+from benchmarks.kalman_filter import PlainKalmanFilter
 from benchmarks.study import (
     EVALUATION_SEED,
     SYMBOLS,
@@ -237,7 +238,7 @@ class VoltageOnly(Calibration):
         """Calibrators without learning. The filter allows for an offset of the sensor, least squares do not."""
         return {
             "least squares": LeastSquares(self.parameters, window_every_s=60.0),
-            "Kalman filter": ExtendedKalmanFilter(self.parameters),
+            "Kalman filter": PlainKalmanFilter(self.parameters),
         }
 
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -33,10 +33,11 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import trange
 
-from battery_env import ExtendedKalmanFilter, OnnxPolicy, PolicyEstimator
+from battery_env import OnnxPolicy, PolicyEstimator
 from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.records import Stream
+from benchmarks.kalman_filter import PlainKalmanFilter
 from benchmarks.study import Study, command_line, markdown, positive
 from sb3_lac import LAC, GymnasiumVecEnv, PublishedLAC
 
@@ -180,10 +181,7 @@ def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
         return count
 
     return {
-        "ExtendedKalmanFilter": partial(stream, ExtendedKalmanFilter(thermal=True)),
-        "ExtendedKalmanFilter, prior of an earlier discharge": partial(
-            stream, ExtendedKalmanFilter(thermal=True, prior_q_mobile_C=(6050.0, 60.0))
-        ),
+        "plain extended Kalman filter": partial(stream, PlainKalmanFilter(thermal=True)),
         "PolicyEstimator": partial(stream, PolicyEstimator(model, _POLICY_ENV)),
         "PolicyEstimator, ONNX": partial(
             stream, PolicyEstimator(OnnxPolicy(export_onnx(model, folder / "p.onnx")), _POLICY_ENV)

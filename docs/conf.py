@@ -85,7 +85,7 @@ SOUGHT = {
     "parameters": ("capacity", "DCIR, HPPC", "EIS, impedance", "internal resistance"),
     "real_cells": ("cut-off", "settled", '"not known to 2 %"'),
     "several_environments": ("several environments", "SubprocVecEnv, make_vec_env"),
-    "streaming": ("BMS", "Kalman filter"),
+    "streaming": ("BMS", "sample by sample"),
     "tensorboard": ("wandb, Weights & Biases",),
     "tester_files": ("Arbin, Maccor, Neware, BioLogic", "CSV, Excel, Parquet"),
     "train_fast": ("GPU",),

@@ -29,9 +29,9 @@ from stable_baselines3 import SAC, TD3
 
 from battery_env import PolicyEstimator, evaluate, forecast, load_nasa_discharges, read_discharges, simulate, track_life
 from battery_env.__main__ import calibrate as battery_calibrate
-from battery_env.estimators import ClosedForm, ExtendedKalmanFilter, LeastSquares, cramer_rao_bound, fit_cell
+from battery_env.estimators import ClosedForm, LeastSquares, cramer_rao_bound, fit_cell
 from battery_env.loads import BlockBootstrap, Cycle, Load
-from battery_env.sensors import RandomSensorErrors, SensorErrors
+from battery_env.sensors import SensorErrors
 from battery_env.tasks.data import standard_dataset
 from sb3_lac import LAC, certify, evaluate_lyapunov, fit_lyapunov
 from sb3_lac.envs import reference_controller
@@ -83,23 +83,19 @@ def calibrators() -> Numbers:
     paper, drive = standard_dataset("q_mobile", "paper", "test"), standard_dataset(("q_mobile", "r_o"), "random_walk", "test")
     of_paper, of_drive = paper.subset([5, 900]), drive.subset([1, 7])
     errors = SensorErrors(noise_V=0.005, offset_V=0.01)
-    estimators = {"least_squares": LeastSquares(), "kalman": ExtendedKalmanFilter(), "policy": PolicyEstimator.pretrained()}
+    estimators = {"least_squares": LeastSquares(), "policy": PolicyEstimator.pretrained()}
     for k, trace in enumerate(ClosedForm().trace(of_paper)):
         yield f"closed_form/{k}", np.column_stack([trace.time_s, trace.q_mobile, trace.r_o])
     for name, estimator in estimators.items():
         frame = evaluate(estimator, of_drive, errors, seed=1).drop(columns="time_per_update_s")
         yield f"{name}/evaluate", frame.select_dtypes("number").to_numpy(dtype=float)
     yield "cramer_rao", np.array(list(vars(cramer_rao_bound(of_drive[0], 0.005)).values()), dtype=object).astype(str)
-    frame = evaluate(ExtendedKalmanFilter(), of_drive, RandomSensorErrors((0.001, 0.03), 0.01), seed=2)
-    yield "kalman/random_errors", frame.drop(columns="time_per_update_s").select_dtypes("number").to_numpy()
 
 
 def streams() -> Numbers:
-    """What the filter and a policy say sample by sample: of whole and changed records."""
+    """What a policy says sample by sample: of whole and changed records."""
     record = load_nasa_discharges("B0005")[40]
     time_s, voltage_V, current_A = (column[::3] for column in (record.time_s, record.voltage_V, record.current_A))
-    assert record.temperature_C is not None
-    temperature_C = record.temperature_C[::3]
     dt_s = np.diff(time_s, prepend=time_s[0])
     gap, spike, charged = dt_s.copy(), voltage_V.copy(), voltage_V.copy()
     gap[60:], spike[50] = dt_s[60:] + 400.0 * (np.arange(60, len(dt_s)) == 60), np.nan
@@ -112,32 +108,24 @@ def streams() -> Numbers:
         "steps": (voltage_V, current_A * np.where(np.arange(len(dt_s)) % 20 < 10, 1.0, 0.2), dt_s),
         "offset": (voltage_V + 0.08, current_A, dt_s),
     }
-    filters = {
-        "kalman": ExtendedKalmanFilter(mismatch_V=0.02),
-        "thermal": ExtendedKalmanFilter(thermal=True, mismatch_V=0.05, initial_soc=(0.95, 0.02)),
-        "prior": ExtendedKalmanFilter(prior_q_mobile_C=(6500.0, 200.0), mismatch_V=0.02),
-        "policy": PolicyEstimator.pretrained("BatteryVoltageJoint-v0", recorded=True),
-    }
-    for name, estimator in filters.items():
-        for what, columns in changed.items():
-            estimator.reset()
-            said = []
-            for n, (volts, amperes, step_s) in enumerate(zip(*columns, strict=True)):
-                said.append(estimator.update(volts, amperes, step_s, temperature_C[n] if name == "thermal" else None))
-            now = estimator.remaining(2.0, 2.7)
-            yield f"stream/{name}/{what}/remaining", np.array([now.time_s, now.sd_s, estimator.soc, estimator.voltage_V])
-            yield f"stream/{name}/{what}", np.array([[e.q_mobile, e.r_o, e.sd_q_mobile, e.sd_r_o, e.settled] for e in said])
-            yield f"stream/{name}/{what}/reason", np.array([e.reason for e in said[::7]])
+    estimator = PolicyEstimator.pretrained("BatteryVoltageJoint-v0", recorded=True)
+    for what, columns in changed.items():
+        estimator.reset()
+        said = [estimator.update(*sample) for sample in zip(*columns, strict=True)]
+        now = estimator.remaining(2.0, 2.7)
+        yield f"stream/policy/{what}/remaining", np.array([now.time_s, now.sd_s, estimator.soc, estimator.voltage_V])
+        yield f"stream/policy/{what}", np.array([[e.q_mobile, e.r_o, e.sd_q_mobile, e.sd_r_o, e.settled] for e in said])
+        yield f"stream/policy/{what}/reason", np.array([e.reason for e in said[::7]])
     load = np.where(np.arange(9000) // 300 % 2 == 0, 1.0, 2.5)
-    filters["kalman"].reset()
+    estimator.reset()
     for sample in zip(voltage_V[:60], current_A[:60], dt_s[:60], strict=True):
-        filters["kalman"].update(*sample)
+        estimator.update(*sample)
     for name, given in {
         "array": load,
         "cycle": Cycle(Load(np.array([0.0, 30.0]), np.array([3.0, 6.0])), 60.0),
         "function": lambda t: 1.0 + t / 1e4,
     }.items():
-        yield f"remaining/{name}", np.array(filters["kalman"].remaining(given, 2.8, "power" if name == "cycle" else "current"))
+        yield f"remaining/{name}", np.array(estimator.remaining(given, 2.8, "power" if name == "cycle" else "current"))
 
 
 def fits() -> Numbers:
@@ -210,7 +198,6 @@ def command_line() -> Numbers:
         for what, arguments in {
             "bundled": ["B0005:40"],
             "several": ["B0005:10", "B0005:160", "B0006:80"],
-            "kalman": ["B0005:40", "--method", "kalman"],
             "policy": ["B0006:40", "--method", "policy"],
             "rest": ["B0005:40", "--initial-soc", "rest"],
             "partly": ["B0005:40", "--initial-soc", "0.9,0.02"],
@@ -218,7 +205,6 @@ def command_line() -> Numbers:
             "walk": ["walk.csv", "--cut-off", "3.0", "--mismatch", "0"],
             "half": ["half.csv"],
             "half_prior": ["half.csv", "--prior", "6800", "150"],
-            "half_kalman": ["half.csv", "--method", "kalman"],
             "odd": ["odd.csv"],
             "missing": ["nowhere.csv"],
         }.items():

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import battery_env.files
 import sb3_lac.files
-from battery_env import ExtendedKalmanFilter, PolicyEstimator, TrajectoryDataset, load_nasa_discharges
+from battery_env import PolicyEstimator, TrajectoryDataset, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.lab.running import read_load
 from battery_env.loads import constant
@@ -30,7 +30,7 @@ def of_data(which, path):
 
 
 def of_a_state(which, path):
-    estimator = ExtendedKalmanFilter()
+    estimator = PolicyEstimator.pretrained()
     estimator.update(4.1 if which == OLD else 4.2, 1.0, 0.0)
     estimator.save(path)
 
@@ -54,7 +54,7 @@ def models():
 WRITERS = {
     "cell.json": (of_constants, CellParameters.from_json, False),
     "data.npz": (of_data, TrajectoryDataset.load, False),
-    "state": (of_a_state, lambda path: ExtendedKalmanFilter().load(path), True),
+    "state": (of_a_state, lambda path: PolicyEstimator.pretrained().load(path), True),
     "figure.png": (of_a_figure, None, True),
     "table.csv": (of_a_table, None, True),
     "model.zip": ("save", lambda path: LAC.load(path, device="cpu"), True),
@@ -162,19 +162,19 @@ def test_a_strangers_file_is_left_alone(tmp_path):
     for content in (b"", b"Dear all", bytes(1000), b'{"kind": "letter"}'):
         path.write_bytes(content)
         with pytest.raises(ValueError, match="is damaged, or no state of an estimator"):
-            ExtendedKalmanFilter().load(path)
+            PolicyEstimator.pretrained().load(path)
         with pytest.raises(FileExistsError, match="is no state of an estimator"):
-            ExtendedKalmanFilter().save(path)
+            PolicyEstimator.pretrained().save(path)
         assert path.read_bytes() == content
 
 
-@pytest.fixture(scope="module", params=[lambda: ExtendedKalmanFilter(thermal=True), PolicyEstimator.pretrained])
-def streamed(request):
+@pytest.fixture(scope="module")
+def streamed():
     """An estimator in the middle of a discharge, and how to make another one."""
-    estimator, record = request.param(), load_nasa_discharges("B0005")[0].loaded_part(2.7)
+    estimator, record = PolicyEstimator.pretrained(), load_nasa_discharges("B0005")[0].loaded_part(2.7)
     for sample in zip(record.voltage_V[:60], record.current_A[:60], np.diff(record.time_s, prepend=0.0)[:60], strict=True):
         estimator.update(*sample)
-    return estimator, request.param
+    return estimator, PolicyEstimator.pretrained
 
 
 def test_a_state_that_was_changed_is_refused_whole(streamed, tmp_path):

@@ -57,20 +57,15 @@ BY_Q, BY_R, BY_KN, BY_KP, BY_T_DIFFUSION, BY_TO, BY_TSN, BY_TSP = range(len(TANG
 
 
 class PolynomialDerivatives(NamedTuple):
-    """
-    The first and second derivatives of both equilibrium-potential polynomials, V, laid out as the polynomials, shape (14,).
-    """
+    """The derivatives of both equilibrium-potential polynomials, V, laid out as the polynomials, shape (14,)."""
 
     slope_n: FloatArray
     slope_p: FloatArray
-    curvature_n: FloatArray
-    curvature_p: FloatArray
 
     @classmethod
     def of(cls, packed: PackedConstants) -> PolynomialDerivatives:
         """Differentiate the polynomials of a cell."""
-        slopes = [_differentiated(polynomial) for polynomial in packed[1:]]
-        return cls(*slopes, *map(_differentiated, slopes))
+        return cls(*(_differentiated(polynomial) for polynomial in packed[1:]))
 
 
 def _differentiated(coefficients: FloatArray) -> FloatArray:
@@ -85,17 +80,6 @@ def equilibrium_slopes(
     nernst = constants[0, R_OVER_F] * tb
     by_xn = nernst / (xn * (1.0 - xn)) - 2.0 * polynomial(derivatives.slope_n, 2.0 * xn - 1.0)
     by_xp = 2.0 * polynomial(derivatives.slope_p, 2.0 * xp - 1.0) - nernst / (xp * (1.0 - xp))
-    return by_xn, by_xp
-
-
-@inlined
-def equilibrium_curvatures(
-    xn: float, xp: float, tb: float, constants: FloatArray, derivatives: PolynomialDerivatives
-) -> tuple[float, float]:
-    # second derivatives of kernels.equilibrium_voltage with respect to xn and xp; the mixed one is zero
-    nernst = constants[0, R_OVER_F] * tb
-    by_xn = nernst * (2.0 * xn - 1.0) / (xn * (1.0 - xn)) ** 2 - 4.0 * polynomial(derivatives.curvature_n, 2.0 * xn - 1.0)
-    by_xp = 4.0 * polynomial(derivatives.curvature_p, 2.0 * xp - 1.0) - nernst * (2.0 * xp - 1.0) / (xp * (1.0 - xp)) ** 2
     return by_xn, by_xp
 
 
@@ -173,22 +157,6 @@ def _voltage_rate_tangents(
     for row in range(BY_KN, dx.shape[1]):
         dxn, dxp = _rate_fraction_tangents(dx, row, q, packed.constants)
         by_parameter[row, k] = _voltage_tangent(dx, row, v_xn * dxn + v_xp * dxp, v_tb)
-
-
-@inlined
-def voltage_curvature(
-    x: FloatArray, dx: FloatArray, q: float, packed: PackedConstants, derivatives: PolynomialDerivatives
-) -> float:
-    # The second derivative of the voltage with respect to q along the tangent of the state
-    constants, tb = packed.constants, x[0, TB]
-    xn, xp = _fractions(x, q, False, constants)
-    dxn, dxp = _fraction_tangents(dx, xn, xp, q, constants)
-    v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, derivatives)
-    v_xn_xn, v_xp_xp = equilibrium_curvatures(xn, xp, tb, constants, derivatives)
-    # of a charge that is linear in q, over q
-    of_fractions = v_xn_xn * dxn * dxn + v_xp_xp * dxp * dxp - 2.0 * (v_xn * dxn + v_xp * dxp) / q
-    nernst = constants[0, R_OVER_F] * dx[0, BY_Q, TB]
-    return of_fractions + 2.0 * nernst * (dxn / (xn * (1.0 - xn)) - dxp / (xp * (1.0 - xp)))
 
 
 @inlined

@@ -14,5 +14,4 @@ from battery_env.estimators.estimator import OnlineEstimator as OnlineEstimator
 from battery_env.estimators.estimator import Remaining as Remaining
 from battery_env.estimators.fit_life import fit_life as fit_life
 from battery_env.estimators.joint_fit import fit_cell as fit_cell
-from battery_env.estimators.kalman import ExtendedKalmanFilter as ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares as LeastSquares

@@ -230,14 +230,6 @@ class CellFit:
         return {each.name: hypot(each.sd, SAME_KIND_SD) for each in self.constants if each.name in RATE_PRIOR_SD}
 
     @property
-    def sd_r_o_ohm(self) -> float:
-        """
-        What the discharges leave open of any ``r_o`` that is found with the constants, ohm: under one load, without pauses,
-        ``r_o`` and the overpotentials look alike.
-        """
-        return min(each.sd_r_o for each in self.discharges)
-
-    @property
     def q_mobile_bounds_C(self) -> tuple[float, float]:
         """Where to search for ``q_mobile``, C: a cell does not grow."""
         return Q_MOBILE.limits[0], min(_GROWTH * self.cell.q_mobile, Q_MOBILE.limits[1])

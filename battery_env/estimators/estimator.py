@@ -8,20 +8,17 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtri
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_numbers
-from battery_env.electrochemistry import STATE_SIZE, CellParameters, LoadUnit, state_of_charge, voltage
-from battery_env.electrochemistry.ends import BAND, LONGEST_S, Cells, run_down
+from battery_env.electrochemistry import LoadUnit, voltage
+from battery_env.electrochemistry.ends import LONGEST_S, Cells, run_down
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
 from battery_env.estimators.state_files import Saved
 from battery_env.loads import KnownLoad, Load, known_load
 from battery_env.parameters import PARAMETERS
 from battery_env.records import Record, Stream
-
-# Points between limits keep this far from them, as a share of their distance, so that rounding leaves them within.
-ROUNDING = 1e-9
+from battery_env.records.model import RecordModel
 
 
 class Estimator(ABC):
@@ -44,49 +41,11 @@ class Remaining(NamedTuple):
     How long a discharge will go on.
 
     :param time_s: until the cut-off, s; infinite if it is not reached within a week
-    :param sd_s: its standard deviation, from what is not known of the model at hand, s; NaN if the estimator states none
+    :param sd_s: its standard deviation, s; NaN if the estimator states none
     """
 
     time_s: float
-    sd_s: float
-
-    def quantile_s(self, probability: ArrayLike = BAND) -> FloatArray:
-        """
-        Quantiles of that time, which is taken to be normal.
-
-        :param probability: within 0 .. 1, any shape
-        :return: s, same shape; NaN if no standard deviation is stated
-        """
-        return np.maximum(self.time_s + self.sd_s * ndtri(np.asarray(probability, dtype=np.float64)), 0.0)
-
-
-class ModelNow(NamedTuple):
-    """
-    Where the model of an estimator stands in the middle of a discharge.
-
-    :param cell: its constants
-    :param thermal: whether its temperature moves
-    :param dt_s: its time step, s
-    :param state: shape (8,)
-    :param parameters: ``q_mobile``, C, ``r_o``, ohm, and the offset of the measured voltage, V, shape (3,)
-    :param deviations: what is not known of state and parameters: independent deviations of one standard deviation each, shape
-        (k, 11)
-    """
-
-    cell: CellParameters
-    thermal: bool
-    dt_s: float
-    state: FloatArray
-    parameters: FloatArray
-    deviations: FloatArray
-
-    def draws(self, samples: int, rng: np.random.Generator) -> Cells:
-        """Cells that may be the one that was followed, all equally likely: state, parameters and offset belong together."""
-        middle = np.concatenate([self.state, self.parameters])
-        points = middle + rng.standard_normal((samples, len(self.deviations))) @ self.deviations
-        for n, parameter in enumerate(PARAMETERS.values(), start=STATE_SIZE):
-            points[:, n] = np.clip(points[:, n], *parameter.limits)
-        return _cells_at(points)
+    sd_s: float = float("nan")
 
 
 class OnlineEstimator(Saved, Estimator):
@@ -127,24 +86,24 @@ class OnlineEstimator(Saved, Estimator):
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
 
-    def now(self) -> ModelNow:
+    def at_last_sample(self) -> tuple[RecordModel, Cells]:
         """
-        Where the model stands at the last sample, which ``soc``, ``voltage_V`` and :meth:`remaining` are told from, if there
-        is one.
+        The model that follows the discharge, if there is one, and its cell at the last sample, which ``soc``, ``voltage_V``
+        and :meth:`remaining` are told from.
         """
         raise NotImplementedError(f"{type(self).__name__} has no model that follows the discharge")
 
     @property
     def soc(self) -> float:
         """State of charge at the last sample: the share of ``q_mobile`` in the negative electrode."""
-        now = self.now()
-        return float(state_of_charge(now.state, now.parameters[0]))
+        _, cell = self.at_last_sample()
+        return float(cell.soc[0])
 
     @property
     def voltage_V(self) -> float:
-        """Voltage of the model at the last sample, with the offset that the estimator found, V."""
-        now = self.now()
-        return float(voltage(now.state, now.parameters[0], now.cell)) + float(now.parameters[2])
+        """Voltage of the model at the last sample, V."""
+        model, cell = self.at_last_sample()
+        return float(voltage(cell.state[0], cell.q_mobile[0], model.cell))
 
     def remaining(
         self,
@@ -153,9 +112,8 @@ class OnlineEstimator(Saved, Estimator):
         load_unit: LoadUnit = "current",
     ) -> Remaining:
         """
-        The time to the cut-off under a load, from the last sample on. Its standard deviation is that of parameters, state and
-        offset: the change of the time over one standard deviation of each to both sides, or to one where the other one leaves
-        what a cell can be. :func:`battery_env.forecast` counts more, and takes random loads; it needs the record.
+        The time to the cut-off under a load, from the last sample on. What is not known of it :func:`battery_env.forecast`
+        tells, which takes random loads too; it needs the record.
 
         :param load: a number; an array of one value a step of ``dt_s``; a :class:`battery_env.loads.Load` or a ``Cycle``, of
             which the mean over each step counts, in its own unit; or any function of time in s, of which its value at the
@@ -165,28 +123,18 @@ class OnlineEstimator(Saved, Estimator):
         :raises ValueError: for an invalid load, also for one that varies and charges the cell beyond full, and for
             an array that ends before the discharge does
         """
-        now = self.now()
-        middle, dt_s = np.concatenate([now.state, now.parameters]), now.dt_s
+        model, cell = self.at_last_sample()
         values = np.empty(0) if callable(load) or np.ndim(load) == 0 else check_numbers("load", load)
-        starts_s = dt_s * np.arange(len(values), dtype=np.float64)
-        given_s = len(values) * dt_s if len(values) else np.inf
+        starts_s = model.dt_s * np.arange(len(values), dtype=np.float64)
+        given_s = len(values) * model.dt_s if len(values) else np.inf
         given = Load(starts_s, values, load_unit) if len(values) else known_load(load, load_unit)
-        # to both sides, or as far as parameters go, and the middle
-        shares = np.array([[-_room(middle, -each), 0.0, _room(middle, each)] for each in now.deviations]).reshape(-1, 3)
-        points = np.vstack(
-            [middle, *(middle + share[:, None] * each for share, each in zip(shares, now.deviations, strict=True))]
-        )
-        end_V = now.cell.VEOD if cut_off_V is None else cut_off_V
-        ends_s = run_down(_cells_at(points), now, [given], end_V).time_s
-        if given_s < min(ends_s[0], LONGEST_S):
+        (end_s,) = run_down(cell, model, [given], model.cell.VEOD if cut_off_V is None else cut_off_V).time_s
+        if given_s < min(end_s, LONGEST_S):
             raise ValueError(
                 f"load ends after {given_s:g} s, before the discharge does. Append what is to come, or "
                 "give a Load of battery_env.loads, whose last value goes on."
             )
-        if np.isinf(ends_s[0]) or not len(shares):
-            return Remaining(float(ends_s[0]), float("nan"))
-        changes_s = [_slope(*each) for each in zip(shares, ends_s[1:].reshape(-1, 3), strict=True)]
-        return Remaining(float(ends_s[0]), float(np.linalg.norm(changes_s)))
+        return Remaining(float(end_s))
 
     def estimate(self, record: Record) -> Estimate:
         """The estimate at the last sample of a record; a ``ValueError`` if that cannot be used."""
@@ -214,26 +162,3 @@ def check_bounds(
     """Refuse invalid bounds."""
     given = zip(PARAMETERS.values(), (q_mobile_bounds_C, r_o_bounds_ohm), strict=True)
     return {parameter.name: parameter.check_bounds(f"the bounds of {parameter.name}", bounds) for parameter, bounds in given}
-
-
-def _cells_at(points: FloatArray) -> Cells:
-    """Cells at points of shape (n, 11): the state, ``q_mobile``, ``r_o``, and the offset of the voltage."""
-    state, (q_mobile, r_o, offset_V) = np.ascontiguousarray(points[:, :STATE_SIZE]), points[:, STATE_SIZE:].T.copy()
-    return Cells(q_mobile, r_o, state, offset_V, np.zeros(len(points)))
-
-
-def _slope(shares: FloatArray, ends_s: FloatArray) -> float:
-    """The change of an end over one deviation, from the outermost points that have one."""
-    reached = np.flatnonzero(np.isfinite(ends_s))
-    first, last = reached[0], reached[-1]
-    return float((ends_s[last] - ends_s[first]) / (shares[last] - shares[first])) if last > first else float("nan")
-
-
-def _room(point: FloatArray, deviation: FloatArray) -> float:
-    """The share of a deviation, at most 1, that leaves the parameters of a point within their limits."""
-    room = 1.0
-    for n, parameter in enumerate(PARAMETERS.values(), start=STATE_SIZE):
-        to_limit = parameter.limits[int(deviation[n] > 0.0)] - point[n]
-        if abs(deviation[n]) > abs(to_limit):
-            room = min(room, (1.0 - ROUNDING) * float(to_limit / deviation[n]))
-    return room

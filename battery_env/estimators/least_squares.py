@@ -24,7 +24,17 @@ from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
 from battery_env.estimators.reasons import Reason
-from battery_env.estimators.search import MARGIN, Fit, JointPrior, Prior, Search, root_inverse_diagonal, square
+from battery_env.estimators.search import (
+    MARGIN,
+    AnyPrior,
+    Fit,
+    JointPrior,
+    Prior,
+    Search,
+    SizePrior,
+    root_inverse_diagonal,
+    square,
+)
 from battery_env.estimators.verdict import (
     PRIOR_LIMIT_SD,
     SPARE_SAMPLES,
@@ -112,6 +122,8 @@ class LeastSquares(Estimator):
     :param q_mobile_bounds_C: where to search, C; the lower one is raised to the least value that the record allows
     :param r_o_bounds_ohm: where to search, ohm
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before this record, C; ``None``: nothing is known
+    :param usual_q_mobile_C: about what cells of this size hold, new or worn, C: a weak prior that nobody stated, so that no
+        settled estimate rests on it, and nothing contradicts it; ``None``: any size is as likely
     :param mismatch_V: error to expect of the model itself, V, as above
     :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: as the record shows it
     :param window_every_s: time between the estimates of :meth:`trace`, s; ``None``: one estimate, at the end
@@ -138,6 +150,7 @@ class LeastSquares(Estimator):
         q_mobile_bounds_C: tuple[float, float] = Q_MOBILE.limits,
         r_o_bounds_ohm: tuple[float, float] = R_O.limits,
         prior_q_mobile_C: tuple[float, float] | None = None,
+        usual_q_mobile_C: float | None = None,
         mismatch_V: float = 0.0,
         voltage_noise_V: float | None = None,
         window_every_s: float | None = None,
@@ -167,7 +180,9 @@ class LeastSquares(Estimator):
             Q_MOBILE.check(prior_q_mobile_C[0])
             if not 0.0 < prior_q_mobile_C[1] < np.inf:
                 raise ValueError(f"prior_q_mobile_C is (mean, sd) with sd > 0, got {prior_q_mobile_C!r}")
-        self.prior_q_mobile_C = prior_q_mobile_C
+        if usual_q_mobile_C is not None:
+            check_positive("usual_q_mobile_C", usual_q_mobile_C)
+        self.prior_q_mobile_C, self.usual_q_mobile_C = prior_q_mobile_C, usual_q_mobile_C
         check_not_negative(mismatch_V=mismatch_V)
         self.mismatch_V = mismatch_V
         self.current_gain_sd = check_gain_sd(current_gain_sd)
@@ -240,10 +255,11 @@ class LeastSquares(Estimator):
     def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]], history: ChargeHistory) -> _Fitted:
         """The best fits with and without the prior, and what their standard deviations are made of."""
         noise_V, at_start_V = self.voltage_noise_V, search.residual(dict.fromkeys(self.nuisance, 0.0) | starts[0])[0]
-        if noise_V is None and (self.nuisance or self.mismatch_V):  # what else is known is weighed against it
+        usual_C = self.usual_q_mobile_C
+        if noise_V is None and (self.nuisance or self.mismatch_V or usual_C):  # what else is known is weighed against it
             noise_V = max(white_noise_V(at_start_V), _LEAST_NOISE_V)
         if self.path is None:
-            priors: list[Prior | JointPrior] = [Prior(name, 0.0, 1.0 / sd) for name, sd in self.nuisance.items()]
+            priors: list[AnyPrior] = [Prior(name, 0.0, 1.0 / sd) for name, sd in self.nuisance.items()]
             cell, drift_V = self.model.cell, WHOLE_ERROR * self.mismatch_V
             if drift_V and noise_V and self._at_rest:  # it is no smaller than the voltage at rest shows, beyond noise
                 start_V2 = float(at_start_V[0]) ** 2 - (MOST_NOISE_SD * noise_V) ** 2 - self.mismatch_V**2
@@ -264,6 +280,9 @@ class LeastSquares(Estimator):
             mismatch_V = sqrt(len(search.data.time_s) / errors) * self.mismatch_V
             error = ErrorModel(noise_V=hypot(noise_V or 0.0, mismatch_V))
         search = replace(search, error=error)
+        if usual_C is not None:
+            priors.append(SizePrior(usual_C))
+            starts = [*starts, *search.starts([usual_C])[0]]
         alone = fit = search.best(starts, priors)
         variance = 1.0 if noise_V else square(alone.residual_V) / (len(alone.residual_V) - len(self.parameters))
         if "q_mobile" in self.parameters:
@@ -271,6 +290,8 @@ class LeastSquares(Estimator):
             is_sure = error.drift_V == 0.0
             knee_C = 0.0 if is_sure else knee_sd_C(record, _model_V(record, alone), self.model.cell.VEOD)
             alone = fit = replace(alone, spread=search.spread(alone, priors, variance), knee_sd_C=knee_C)
+        if usual_C is not None:  # which nobody has stated: a settled estimate does not rest on it, and nothing contradicts it
+            alone = replace(fit, jacobian=fit.jacobian[:-1])
         if self.path is not None:
             # what goes together along the path is a prior of q_mobile too, on which a settled estimate must not rest
             loose = np.pad(np.diag(1.0 / np.array(list(self.nuisance.values()))), ((0, 0), (len(self.parameters), 0)))

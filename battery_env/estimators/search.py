@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from math import exp, inf, isnan, log, sqrt
+from math import copysign, exp, inf, isnan, log, log1p, sqrt
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,8 @@ _LOG_LIMIT = 50.0
 _REACH = 5.0
 # A resistance that the search takes below zero has no logarithm.
 _LEAST = 1e-6
+# About so far apart, in the logarithm of q_mobile, are cells of one size.
+_SIZE_WIDTH = 0.2
 _SCALES = {"q_mobile": 1.0, "r_o": 0.1}
 # Where the search for q_mobile may start: this much above its least value. The narrow ones serve whole discharges, the wide
 # ones the first minutes of one.
@@ -124,6 +126,24 @@ class Prior:
 
 
 @dataclass(frozen=True)
+class SizePrior:
+    """
+    What cells of one size hold, new or worn, as one more residual. Far from ``usual_C`` the density of the logarithm of
+    ``q_mobile`` falls as one over the distance: the size is likely, and none is ruled out.
+    """
+
+    usual_C: float
+
+    def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """The residual, and its derivatives by all unknowns."""
+        distance = log(values["q_mobile"] / self.usual_C) / _SIZE_WIDTH
+        residual = copysign(sqrt(log1p(distance**2)), distance)
+        slope = distance / (1.0 + distance**2) / residual if residual else 1.0
+        row = np.array([[slope / (_SIZE_WIDTH * values["q_mobile"]) if name == "q_mobile" else 0.0 for name in unknown]])
+        return np.array([residual]), row
+
+
+@dataclass(frozen=True)
 class JointPrior:
     """What is known of some unknowns together, as one more residual each; of parameters, of their logarithms."""
 
@@ -143,6 +163,9 @@ class JointPrior:
             if name in columns:
                 by_unknown[:, n] = self.rows[:, columns[name]] * slopes[columns[name]]
         return self.rows @ (x - self.mean), by_unknown
+
+
+AnyPrior = Prior | SizePrior | JointPrior
 
 
 @dataclass(frozen=True)
@@ -267,11 +290,11 @@ class Search:
         rivals = np.union1d(np.flatnonzero(minima), squares.argmin())
         return [starts[order[n]] for n in rivals[np.argsort(squares[rivals], kind="stable")]]
 
-    def best(self, starts: Sequence[dict[str, float]], priors: Sequence[Prior | JointPrior]) -> Fit:
-        """Return the best fit that is found from any of the starts."""
-        return min((self._fit(start, priors) for start in starts), key=lambda fit: fit.square)
+    def best(self, starts: Sequence[dict[str, float]], priors: Sequence[AnyPrior]) -> Fit:
+        """Return the best fit that is found from any of the starts; one without an ``r_o`` is empty on the coarse grid."""
+        return min((self._fit(start, priors) for start in starts if not isnan(start["r_o"])), key=lambda fit: fit.square)
 
-    def _fit(self, start: dict[str, float], priors: Sequence[Prior | JointPrior]) -> Fit:
+    def _fit(self, start: dict[str, float], priors: Sequence[AnyPrior]) -> Fit:
         free, values = list(self.unknown), dict.fromkeys(self.nuisance, 0.0) | start
         while True:
             values = self._minimized(values, free, priors)
@@ -288,7 +311,7 @@ class Search:
         at_bound = tuple(name for name in self.parameters if values[name] in self._bounds_at(values)[name])
         return Fit(values, jacobian, self.residual(values)[0], square(residual), at_bound)
 
-    def spread(self, fit: Fit, priors: Sequence[Prior | JointPrior], variance: float) -> float:
+    def spread(self, fit: Fit, priors: Sequence[AnyPrior], variance: float) -> float:
         """
         How many times as wide as its curvature says the likelihood of ``q_mobile`` is, between the points where it has fallen
         as a normal one does in a standard deviation; at least 1. It is adjusted for the other unknowns (Cox and Reid 1987),
@@ -338,7 +361,7 @@ class Search:
         of_q_C = (max(low_C, (1.0 + MARGIN) * least_C), high_C)
         return {**dict.fromkeys(RATE_CONSTANTS, (-_REACH, _REACH)), **self.bounds, "q_mobile": of_q_C}
 
-    def _minimized(self, start: dict[str, float], free: list[str], priors: Sequence[Prior | JointPrior]) -> dict[str, float]:
+    def _minimized(self, start: dict[str, float], free: list[str], priors: Sequence[AnyPrior]) -> dict[str, float]:
         unknown = self.unknown
         columns = [unknown.index(name) for name in free]
 
@@ -373,7 +396,7 @@ class Search:
         """The error of the voltage at the samples."""
         return self.error.along(self.data.time_s, self.data.samples_A)
 
-    def weighed(self, values: Mapping[str, float], priors: Sequence[Prior | JointPrior]) -> tuple[FloatArray, FloatArray]:
+    def weighed(self, values: Mapping[str, float], priors: Sequence[AnyPrior]) -> tuple[FloatArray, FloatArray]:
         """Return residuals as their error weighs them, with one more for each prior, and their derivatives by all unknowns."""
         residual_V, jacobian_V = self.residual(values)
         rows = self.error_at_samples.whitened(np.column_stack([residual_V, jacobian_V]))

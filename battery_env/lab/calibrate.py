@@ -21,12 +21,10 @@ from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.ends import quantile
-from battery_env.estimates import Estimate, last_estimate
+from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.evidence import evidence_of, fault_reason, start_reason
 from battery_env.estimators.diagnosis.gaps import doubtful_C
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
-from battery_env.estimators.estimator import ModelNow
-from battery_env.estimators.kalman import ExtendedKalmanFilter
 from battery_env.lab.forecast import Forecast, forecast
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable, read_recordings
@@ -83,7 +81,7 @@ def calibrate(
 
     .. code-block:: python
 
-      for found in battery_env.calibrate("life.csv", method="kalman", nominal_Ah=2.0):
+      for found in battery_env.calibrate("life.csv", nominal_Ah=2.0):
           print(found)
 
     Where the start of a discharge is not known, or the voltage before the load contradicts it, where a sensor fails, or where
@@ -141,18 +139,18 @@ def calibrated(
     :param end_is_asked: whether an end that cannot be told is an error, and not only unknown
     """
     is_whole = not np.isnan(discharge.eod_time_s(settings.resolved.cut_off_V))
-    known = settings if is_whole else settings.with_nominal_prior()
+    known, usual_C = (settings, None) if is_whole else (settings.with_nominal_cell(), settings.usual_q_mobile_C)
     part = _look_at(discharge, known)
     if end_is_asked and _is_below_all_sizes(part):
         raise ValueError(_below_all_sizes())
-    estimate, method, model, now = _estimate(part, known, load)
+    estimate, method, model = _estimate(part, known, usual_C)
     # a cell in progress has not ended, however low its model comes in the pulses before
     cut_off_V, current_A = (-np.inf, 0.0) if part.in_progress else (settings.resolved.cut_off_V, part.load.mean_A)
     shown = model.forecast(part.record, estimate, cut_off_V, current_A)
     sized = _of_its_size(estimate, settings, float(part.loaded.charge_C))
     end = None
     if end_is_asked or np.isfinite(sized.q_mobile):  # what has no size has no end
-        end = _end(part, estimate, replace(known, method=method), now or model, shown, load, samples, end_is_asked)
+        end = _end(part, estimate, replace(known, method=method), model, shown, load, samples, end_is_asked)
     charge = _charge(part, settings, estimate, end)
     if part.start.reason or part.more_C or not _is_all_logged(part, known, shown, estimate):
         charge = dict.fromkeys(charge, float("nan"))
@@ -222,26 +220,12 @@ def _look_at(discharge: Discharge, settings: Settings) -> _LoadedPart:
     )
 
 
-def _is_running(part: _LoadedPart) -> bool:
-    """Whether a record is in progress, its load not switched off for good."""
-    return part.in_progress and float(part.discharge.time_s[-1] - part.loaded.time_s[-1]) <= STEADY_S
-
-
-def _estimate(
-    part: _LoadedPart, settings: Settings, load: LoadToCome | None
-) -> tuple[Estimate, Method, RecordModel, ModelNow | None]:
-    """The estimate, the method, the model that it is of, and of the filter where this stands at the end of the record."""
-    is_running, is_new = _is_running(part), settings.prior_q_mobile_C is None and settings.cell is None
-    # before the knee least squares, of which all parameters are free then, take any large q_mobile for likely
-    method = settings.method or ("kalman" if is_running and is_new else "least-squares")
-    calibrator = replace(settings, method=method).calibrator(part.cell, part.start)
-    cell, thermal, now = part.cell, settings.resolved.thermal, None
+def _estimate(part: _LoadedPart, settings: Settings, usual_q_mobile_C: float | None) -> tuple[Estimate, Method, RecordModel]:
+    """The estimate, the method, and the model that it is of."""
+    calibrator = settings.calibrator(part.cell, part.start, usual_q_mobile_C)
+    cell, thermal = part.cell, settings.resolved.thermal
     if _is_below_all_sizes(part):
         estimate = _SMALLEST
-    elif isinstance(calibrator, ExtendedKalmanFilter):
-        estimate = last_estimate(calibrator.follow(part.fitted))
-        # under other loads the filter, which takes the error of the model for noise, is surer than it may be
-        now = calibrator.now() if is_running and load is None and not part.load.varied else None
     else:
         estimate = calibrator.estimate(part.fitted)
     if isinstance(calibrator, PolicyEstimator):
@@ -250,7 +234,7 @@ def _estimate(
         # of the charge: the resistance, which is settled within 30 %, is not in question
         estimate = replace(estimate, settled_q_mobile=False, reason=" ".join(filter(None, [estimate.reason, doubt])))
     model = RecordModel(cell, thermal, initial_soc=part.start.soc)
-    return estimate, method, model, now
+    return estimate, settings.method or "least-squares", model
 
 
 def _is_below_all_sizes(part: _LoadedPart) -> bool:
@@ -285,7 +269,7 @@ def _end(
     part: _LoadedPart,
     estimate: Estimate,
     settings: Settings,
-    model: RecordModel | ModelNow,
+    model: RecordModel,
     shown: VoltageForecast,
     load: LoadToCome | None,
     samples: int,
@@ -326,8 +310,8 @@ def _notes(part: _LoadedPart, estimate: Estimate, settings: Settings, shown: Vol
         yield other_load
     if float(part.discharge.time_s[-1]) > seen_s:
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
-    if settings.method == "kalman" and settings.prior_q_mobile_C is None and settings.cell is None:
-        yield "The filter expects a cell of some 2 Ah: of another one give the nominal capacity, the life, q_max or constants."
+    if settings.usual_q_mobile_C is not None and settings.nominal_Ah is None and settings.method != "policy":
+        yield "A cell of some 2 Ah is expected: of another one give the nominal capacity, the life, q_max or constants."
     if rmse_V > settings.resolved.mismatch_V:
         text = f"The model misses the voltage by {1e3 * rmse_V:.0f} mV (RMSE), more than mismatch_V."
         yield f"{text} Other loads make the interval too narrow."

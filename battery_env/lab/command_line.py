@@ -106,8 +106,7 @@ def _parser() -> argparse.ArgumentParser:
     group.add_argument(
         "--method",
         choices=METHODS,
-        help="of calibration: least squares, the filter (kalman), or the policy that comes with the package (default: the "
-        "filter for a record in progress, if neither a prior nor a cell is given, and else least squares)",
+        help="of calibration: least squares, or the policy that comes with the package (default: least squares)",
     )
     _add_calibration(group)
     group = parser.add_argument_group("results")

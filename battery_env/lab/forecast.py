@@ -12,11 +12,10 @@ from scipy.special import ndtr, ndtri
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_not_negative, check_positive, check_whole_number
-from battery_env.electrochemistry import NEW_CELL, voltage
+from battery_env.electrochemistry import NEW_CELL
 from battery_env.electrochemistry.ends import BAND, Cells, Ends, follow, quantile, run_down
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.estimates import Estimate
-from battery_env.estimators.estimator import ModelNow
 from battery_env.estimators.reasons import is_only_imprecise
 from battery_env.estimators.verdict import white_noise_V
 from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, LoadToCome, RandomLoad, known_load, steadier_unit
@@ -155,7 +154,7 @@ def forecast(
     cut_off_V: float | None = None,
     *,
     load_unit: LoadUnit = "current",
-    model: RecordModel | ModelNow | None = None,
+    model: RecordModel | None = None,
     mismatch_V: float = 0.05,
     nominal_Ah: float | None = None,
     samples: int = 1000,
@@ -188,8 +187,7 @@ def forecast(
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell, 2.7 V if no
         ``model`` is given
     :param load_unit: of a number or a function: ``"power"`` in W or ``"current"`` in A. Other loads have their own
-    :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``. Or that of
-        a filter at the end of the record, ``filter_.now()``: then state, parameters and offset are drawn together
+    :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
     :param mismatch_V: error to expect of the model, V; 0.05 V suits the bundled real cells, 0 simulated ones without mismatch
     :param nominal_Ah: capacity that counts as a state of health of 1, Ah; ``None``: the charge that the model's cell, with
         its own ``q_mobile`` and ``r_o``, gives from full under the load to come, on average where that is random
@@ -200,9 +198,7 @@ def forecast(
     :raises ValueError: for an argument out of range, an estimate that the record contradicts, or a load that charges the cell
         beyond full
     """
-    now = model if isinstance(model, ModelNow) else None
-    if not isinstance(model, RecordModel):
-        model = RecordModel(NEW_CELL.replace(VEOD=CUT_OFF_V)) if now is None else RecordModel(now.cell, now.thermal, now.dt_s)
+    model = RecordModel(NEW_CELL.replace(VEOD=CUT_OFF_V)) if model is None else model
     cut_off = model.cell.VEOD if cut_off_V is None else cut_off_V
     _check_arguments(mismatch_V, cut_off, nominal_Ah, samples, seed)
     seen = check_record(record, least_samples=2)
@@ -210,14 +206,10 @@ def forecast(
     ahead, load_name = _to_come(load, load_unit, seen, model)
     notes = _notes(estimate, seen, load is None and isinstance(ahead, RandomLoad))
 
-    if now is None:
-        model = model.at(estimate)
-        _, current_A = model.grid(seen)
-        q_C, r_ohm, acting_ohm = _draw_parameters(model, current_A[:-1], estimate, mismatch_V, samples, rng)
-        cells, voltage_V = _at_the_end_of(seen, model, current_A, (q_C, acting_ohm), mismatch_V, rng)
-    else:
-        cells = now.draws(samples, rng)._replace(drift_V=mismatch_V * rng.standard_normal(samples))
-        r_ohm, voltage_V = cells.r_o, np.asarray(voltage(cells.state, cells.q_mobile, now.cell))
+    model = model.at(estimate)
+    _, current_A = model.grid(seen)
+    q_C, r_ohm, acting_ohm = _draw_parameters(model, current_A[:-1], estimate, mismatch_V, samples, rng)
+    cells, voltage_V = _at_the_end_of(seen, model, current_A, (q_C, acting_ohm), mismatch_V, rng)
     reached_V = cut_off + _ROUNDING_V
     over = seen.voltage_V[-1] <= reached_V and seen.current_A[-1] > 0.0
     if not over:

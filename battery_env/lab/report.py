@@ -16,9 +16,7 @@ from battery_env.records.discharge import Discharge
 from battery_env.records.model import VoltageForecast
 
 #: The methods, for readers of a figure.
-METHOD_NAMES = {"least-squares": "least squares", "kalman": "Kalman filter", "policy": "policy"}
-# The methods, for readers of a text.
-_CALIBRATED_BY = {"kalman": "the Kalman filter", "policy": "the policy that comes with the package"}
+METHOD_NAMES = {"least-squares": "least squares", "policy": "policy"}
 # Columns of the parameters.
 _COLUMN_OF = {name: f"{name}_{parameter.unit}" for name, parameter in PARAMETERS.items()}
 
@@ -142,7 +140,7 @@ def text_of(name: str, found: Calibration) -> str:
         f"{name}: {found.samples} samples from load-on at {found.shown('load_on_time_s')}, {found.shown('drawn_Ah')} drawn"
     ]
     if found.method != "least-squares":
-        lines.append(f"calibrated by {_CALIBRATED_BY[found.method]}")
+        lines.append("calibrated by the policy that comes with the package")
     lines.append("")
     for column, remark in _rows_of_text(found):
         line = f"  {_HOW[column]['text'].format(found.settings.resolved):<22}{found.shown(column):>12}"

@@ -17,16 +17,17 @@ from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
-from battery_env.estimators.kalman.filter import PRIOR_SD_SHARE_Q, ExtendedKalmanFilter
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.reasons import Reason
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import CUT_OFF_V, DischargeStart
 
-Method = Literal["least-squares", "kalman", "policy"]
+Method = Literal["least-squares", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
+# What cells of some size hold, new or worn, as a share of a new one: about this much.
+_USUAL_SHARE = 0.75
 # Constants that were fitted at one load moved q_mobile by 5 % at twice that load, and so by less than the 2 % of a settled
 # estimate within this ratio.
 _SAME_LOAD = 1.25
@@ -60,13 +61,11 @@ class ResolvedSettings(NamedTuple):
 @dataclass(frozen=True)
 class Settings:
     """
-    How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, and
-    ``Settings(method="kalman").calibrator()`` the filter, with what such a cell needs. What is not stated stays ``None``, so
-    that it follows another ``cell``; :attr:`resolved` has the numbers.
+    How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, with what such a cell needs.
+    What is not stated stays ``None``, so that it follows another ``cell``; :attr:`resolved` has the numbers.
 
-    :param method: of calibration; ``None``: the filter for a record in progress under load, if neither a prior nor the cell is
-        known, and else least squares. ``"policy"`` is the one that comes with the package, for both parameters; its model is a
-        new 18650 at constant temperature
+    :param method: of calibration; ``None``: least squares. ``"policy"`` is the one that comes with the package, for both
+        parameters; its model is a new 18650 at constant temperature
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: where that of the fit of ``cell`` does, or 2.7
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
     :param mismatch_V: error to expect of the model itself, V; ``None``: that of the fit of ``cell``, or 0.05
@@ -178,16 +177,25 @@ class Settings:
             warnings.warn(f"{path}: {cell.doubt}", stacklevel=2)
         return cls(cell=cell, **others)
 
-    def with_nominal_prior(self) -> Settings:
-        """What a nominal capacity tells of a cell of another size than a new 18650, of which nothing else is known."""
+    @property
+    def _new_q_mobile_C(self) -> float:
+        """Of a new cell of the nominal capacity, or of a new 18650 where none is stated."""
+        if self.nominal_Ah is None:
+            return NEW_CELL.q_mobile
+        return float(np.clip(UNDELIVERED * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
+
+    @property
+    def usual_q_mobile_C(self) -> float | None:
+        """About what a cell of its size holds, new or worn, of which nothing else is known; ``None``: more is known."""
         is_known = self.prior_q_mobile_C is not None or self.cell is not None
-        if self.nominal_Ah is None or is_known or self.method == "policy":
+        return None if is_known else _USUAL_SHARE * self._new_q_mobile_C
+
+    def with_nominal_cell(self) -> Settings:
+        """With the constants of a cell of the nominal capacity, where that is of another size and nothing else is known."""
+        cell = new_cell_of(self._new_q_mobile_C)
+        if self.usual_q_mobile_C is None or self.method == "policy" or cell is NEW_CELL:
             return self
-        q_mobile_C = float(np.clip(UNDELIVERED * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
-        if (cell := new_cell_of(q_mobile_C)) is NEW_CELL:
-            return self
-        prior_C = (q_mobile_C, PRIOR_SD_SHARE_Q * q_mobile_C)
-        return replace(self, cell=cell, prior_q_mobile_C=prior_C, cell_rates_sd=RATE_PRIOR_SD)
+        return replace(self, cell=cell, cell_rates_sd=RATE_PRIOR_SD)
 
     def other_load(self, current_A: float) -> str:
         """Why the constants may not hold for a mean current; empty if they do."""
@@ -205,13 +213,15 @@ class Settings:
         return self.cell is not None and high_A <= low_A * _SAME_LOAD and not self.other_load(current_A)
 
     def calibrator(
-        self, cell: CellParameters | None = None, start: Start | None = None
-    ) -> LeastSquares | ExtendedKalmanFilter | PolicyEstimator:
+        self, cell: CellParameters | None = None, start: Start | None = None, usual_q_mobile_C: float | None = None
+    ) -> LeastSquares | PolicyEstimator:
         """
         The calibrator that is asked for. It refuses options that it cannot use.
 
         :param cell: constants of the model at the temperature of a discharge; ``None``: those of the settings
         :param start: how the discharge starts; ``None``: as the settings say
+        :param usual_q_mobile_C: about what cells of its size hold, as :attr:`usual_q_mobile_C` says, for least squares of a
+            record in progress; ``None``: any size is as likely
         :raises ValueError: for an option out of range
         """
         if self.method == "policy":
@@ -227,14 +237,13 @@ class Settings:
             "q_mobile_bounds_C": self.q_mobile_bounds_C,
             "usual_start": resolved.usual_start,
         }
-        if self.method == "kalman":
-            sd_r_o_ohm = self.fit.sd_r_o_ohm if self.fit else 0.0
-            return ExtendedKalmanFilter(mismatch_V=resolved.mismatch_V, cell_sd_r_o_ohm=sd_r_o_ohm, **common)
         rates_sd = self._rates_sd()
         # constants that are anybody's, once they are free, explain as much of the error as q_mobile and r_o absorb
         is_explained = rates_sd is RATE_PRIOR_SD
         mismatch_V = resolved.mismatch_V / WHOLE_ERROR if is_explained else resolved.mismatch_V
-        return LeastSquares(mismatch_V=mismatch_V, nuisance=rates_sd, path=self.path, **common)
+        return LeastSquares(
+            mismatch_V=mismatch_V, nuisance=rates_sd, path=self.path, usual_q_mobile_C=usual_q_mobile_C, **common
+        )
 
     def _rates_sd(self) -> Mapping[str, float]:
         """

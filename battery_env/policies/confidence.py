@@ -13,7 +13,6 @@ from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.evidence import evidence_of, measured, unseen_C
 from battery_env.estimators.diagnosis.faults import MOST_NOISE_SD
 from battery_env.estimators.diagnosis.rest import rest_voltage_V
-from battery_env.estimators.estimator import ROUNDING
 from battery_env.estimators.reasons import Reason
 from battery_env.estimators.search import square
 from battery_env.estimators.verdict import (
@@ -30,6 +29,8 @@ from battery_env.records.model import RecordModel
 from battery_env.tasks.voltage.fit import REACH_SD, Fitted
 from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES, VoltageTask
 
+# What is within its reach by less than this share may lie at its edge but for rounding.
+_ROUNDING = 1e-9
 # Residuals below this may be what a linear step leaves, V
 _LINEAR_STEP_V = 2e-3
 
@@ -86,7 +87,7 @@ class Confidence:
             ("distance from the constants that it has learned of", float(fitted.constants_sd[n]), most_sd),
             ("offset of the voltage", abs(float(fitted.offset_V[n])), MISMATCH_MARGIN * self._offset_V),
         ):
-            if size > (1.0 - ROUNDING) * most:  # as a fit keeps within its reach
+            if size > (1.0 - _ROUNDING) * most:  # as a fit keeps within its reach
                 diagnosis.note(Reason.OTHER_KIND, what=what, ratio=size / most)
         for k, name in enumerate(PARAMETER_NAMES):
             if name in self._parameters:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive
-from battery_env.electrochemistry import NEW_CELL, STATE_SIZE
+from battery_env.electrochemistry import NEW_CELL
 from battery_env.electrochemistry.aging_path import cell_with
-from battery_env.electrochemistry.ends import SURPLUS_SHARE
+from battery_env.electrochemistry.ends import SURPLUS_SHARE, Cells
 from battery_env.estimates import last_estimate
-from battery_env.estimators.estimator import Estimate, EstimateTrace, ModelNow, OnlineEstimator, Record
+from battery_env.estimators.estimator import Estimate, EstimateTrace, OnlineEstimator, Record
 from battery_env.estimators.reasons import Reason
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
@@ -221,14 +221,14 @@ class PolicyEstimator(OnlineEstimator):
         self._decisions, self._now = due, task.estimate[0]
         self._judge()
 
-    def now(self) -> ModelNow:
-        """The model at the last sample, with the estimate as its parameters."""
+    def at_last_sample(self) -> tuple[RecordModel, Cells]:
+        """The model that follows the discharge, and its cell at the last sample, with the estimate as its parameters."""
         model = RecordModel(cell_with(self.cell, self._estimate.constants), dt_s=self.dt_s)
         q_mobile, r_o = self._now.tolist()
         state = model.start(q_mobile)
         if self._samples and self._samples[-1][0] > 0.0:
             state = model.simulate(on_grid(self._samples, self.dt_s).current_A, q_mobile, r_o).state[-1]
-        return ModelNow(model.cell, False, self.dt_s, state, np.append(self._now, 0.0), np.zeros((0, STATE_SIZE + 3)))
+        return model, Cells(self._now[:1], self._now[1:], state[None], np.zeros(1), np.zeros(1))
 
     def _made_with(self) -> dict[str, Any]:
         return {

@@ -67,10 +67,9 @@ class Discharge:
     :param time_s: times of the samples, strictly increasing, s, shape (T,)
     :param voltage_V: terminal voltage, V, shape (T,)
     :param current_A: current, positive in discharge, A, shape (T,)
-    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if it was not measured. The model of
-        ``ExtendedKalmanFilter`` follows it. ``LeastSquares`` does not read it: its model makes its own, from the surroundings
-        ``Tb0`` of its cell, for which the command line takes the first one. Nor does ``PolicyEstimator``, whose model is
-        isothermal
+    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if it was not measured. No model reads it but
+        for its first value, which :func:`battery_env.calibrate` takes for that of the surroundings: ``LeastSquares`` makes its
+        own from there, and the model of ``PolicyEstimator`` is isothermal
     :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
     :param starts_at_rest: whether the first voltage is that of the cell at rest, and the first current that of the load
         that is switched on then, as in a :meth:`loaded_part`. Calibrators judge by it whether the cell was full

@@ -111,7 +111,7 @@ class RecordModel:
 
     .. code-block:: python
 
-      estimate = ExtendedKalmanFilter(thermal=True, mismatch_V=0.05).estimate(record)
+      estimate = LeastSquares(thermal=True, mismatch_V=0.05).estimate(record)
       forecast = RecordModel(thermal=True).forecast(record, estimate, cut_off_V=2.7)
       print(forecast.eod_time_s)
 

@@ -270,7 +270,7 @@ class TestCalibrations:
 
     def test_a_path_is_for_least_squares(self, path):
         with pytest.raises(ValueError, match="is for least squares"):
-            Settings(cell=path, method="kalman")
+            Settings(cell=path, method="policy")
 
 
 #: It leaves the estimate where the fit in its observation puts it.

@@ -13,12 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from battery_env import NEW_CELL, Discharge, PolicyEstimator, Settings, fit_cell, initial_state, load_nasa_discharges, simulate
-from battery_env.estimates import Estimate, last_estimate
-from battery_env.estimators import CellFit, ClosedForm, ExtendedKalmanFilter, LeastSquares, soc_from_rest
-from battery_env.estimators.estimator import OnlineEstimator
+from battery_env.estimates import Estimate
+from battery_env.estimators import CellFit, ClosedForm, LeastSquares, soc_from_rest
 from battery_env.lab.calibrate import calibrated
 from battery_env.policies.pretrained import pretrained_ids
-from battery_env.records import Samples, Stream
+from battery_env.records import Samples
 from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES
 from tests.sweeps import sweep
 
@@ -178,7 +177,7 @@ def broken(case: Case, fault: str, rng: np.random.Generator) -> Case:
 
 
 def calibrators(case: Case) -> dict[str, object]:
-    """As the command line has them, the filter with its defaults and with the error that real cells need, and policies."""
+    """As the command line has them, and policies."""
     more = {"thermal": True, "prior_q_mobile_C": case.prior_q_mobile_C, "current_gain_sd": case.gain_sd}
 
     def calibrator(kind: type, mismatch_V: float) -> object:
@@ -190,32 +189,12 @@ def calibrators(case: Case) -> dict[str, object]:
 
     return {
         "least squares": lambda: calibrator(LeastSquares, 0.05),
-        "filter": lambda: calibrator(ExtendedKalmanFilter, 0.0),
-        "filter, mismatch": lambda: calibrator(ExtendedKalmanFilter, 0.05),
         "policy": PolicyEstimator.pretrained,
         "policy for recorded cells": lambda: PolicyEstimator.pretrained(recorded=True),
     }
 
 
-def paths(estimator: object) -> dict[str, object]:
-    """The ways from a record to an estimate: whole, as a trace, and sample by sample."""
-
-    def stream(record: Discharge | Case) -> Estimate:
-        estimator.reset()
-        for sample in Stream.of(record, estimator.dt_s).samples():
-            estimate = estimator.update(*sample)
-        return estimate
-
-    def trace(record: Discharge | Case) -> Estimate:
-        return last_estimate(estimator.trace([record])[0])
-
-    known = {"whole": estimator.estimate, "trace": trace, "stream": stream}
-    return known if isinstance(estimator, OnlineEstimator) else {"whole": estimator.estimate}
-
-
-def outcome(
-    case: Case, make: object, path: str = "whole", record: Discharge | Case | None = None
-) -> tuple[str, Estimate | None]:
+def outcome(case: Case, make: object, record: Discharge | Case | None = None) -> tuple[str, Estimate | None]:
     """
     ``refused``, ``not settled``, ``right``, or ``wrong``: a number is settled, and off by more than 5 % and 3 standard
     deviations. The record is that of the case unless it is given.
@@ -227,7 +206,7 @@ def outcome(
                 record = case
                 if case.recorded:
                     record = Discharge(case.time_s, case.voltage_V, case.current_A)
-            estimate = paths(make())[path](record)
+            estimate = make().estimate(record)
     except (TypeError, ValueError):
         return "refused", None
     for name in ("q_mobile", "r_o"):
@@ -318,30 +297,18 @@ def swept(case: Case, fault: str, size: float, place: float) -> Case:
 
 
 def swept_answers(case: Case, fault: str) -> list[tuple[object, ...]]:
-    """
-    Answers of all methods, and of streams, over the size of a fault. Of a recorded cell its part under load is judged, by
-    methods that know of the error of the model; a stream is of all of it. A simulated one has a sample a second, which is
-    streamed with each size at one of the places in turn.
-    """
-    names = ("least squares", *(() if case.recorded else ("filter",)), "filter, mismatch")
+    """What least squares answer over the size of a fault; of a recorded cell its part under load is judged."""
     answers = []
-    places = PLACES.get(fault, (0.5,))
-    for turn, size in enumerate(SWEEPS[fault]):
-        for place in places:
+    for size in SWEEPS[fault]:
+        for place in PLACES.get(fault, (0.5,)):
             faulty = swept(case, fault, size, place)
-            records: dict[str, Discharge | Case] = {"whole": faulty, "stream": faulty}
+            record: Discharge | Case = faulty
             if case.recorded:
                 try:
-                    whole = Discharge(faulty.time_s, faulty.voltage_V, faulty.current_A)
-                    records = {"whole": whole.loaded_part(2.7), "stream": whole}
+                    record = Discharge(faulty.time_s, faulty.voltage_V, faulty.current_A).loaded_part(2.7)
                 except ValueError:
                     continue
-            for name in names:
-                # one sample at rest tells a stream of no offset
-                is_whole = fault == "current off" if case.recorded else place != places[turn % len(places)]
-                for path in ("whole", "stream")[: 1 if is_whole or name == "least squares" else 2]:
-                    found = outcome(faulty, calibrators(faulty)[name], path, records[path])
-                    answers.append((size, place, name, path, *found))
+            answers.append((size, place, *outcome(faulty, calibrators(faulty)["least squares"], record)))
     return answers
 
 
@@ -356,11 +323,10 @@ def test_no_fault_of_any_size_leaves_a_wrong_number_settled(cell, fault):
         columns = {column: getattr(whole, column) for column in ("time_s", "voltage_V", "current_A")}
         case = replace(recorded(name, int(number)), **columns)
     answers = swept_answers(case, fault)
-    assert answers and not [answer for answer in answers if answer[4] == "wrong"]
+    assert answers and not [answer for answer in answers if answer[2] == "wrong"]
     if case.recorded and fault in ("current drops out", "rows lost"):
         # what it costs is a doubt, and no refusal
-        smallest, sound = min(SWEEPS[fault]), [answer for answer in answers if answer[2] == "least squares"]
-        assert {answer[4] for answer in sound if answer[0] == smallest} == {"right"}
+        assert {answer[2] for answer in answers if answer[0] == min(SWEEPS[fault])} == {"right"}
 
 
 @pytest.mark.attacks
@@ -371,7 +337,7 @@ def test_a_load_that_is_switched_between_rows_leaves_no_wrong_number_settled(ste
     record = simulate(current_A, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.8)
     voltage_V = record.voltage_V + np.random.default_rng(9).normal(0.0, 0.002, len(record.voltage_V))
     answers = swept_answers(Case(record.time_s, voltage_V, record.current_A, 6000.0, 0.15, recorded=False), "rows apart")
-    assert not [answer for answer in answers if answer[4] == "wrong"]
+    assert not [answer for answer in answers if answer[2] == "wrong"]
     # what is advised settles it
     for size in SWEEPS["rows apart"][:5] if steady_s > 20 else ():
         beside = np.flatnonzero(np.diff(current_A[: len(voltage_V)]))
@@ -379,40 +345,24 @@ def test_a_load_that_is_switched_between_rows_leaves_no_wrong_number_settled(ste
         sampled = Samples(record.time_s[rows], voltage_V[rows], record.current_A[rows])
         found = LeastSquares(thermal=True, mismatch_V=0.01).estimate(sampled)
         assert found.settled and found.q_mobile == pytest.approx(6000.0, rel=0.01)
-        followed = last_estimate(ExtendedKalmanFilter(thermal=True, mismatch_V=0.01).follow(sampled))
-        assert "switched between" not in followed.reason and followed.q_mobile == pytest.approx(6000.0, rel=0.01)
-
-
-@pytest.mark.parametrize("fault", sweep(*(fault for fault in FAULTS if fault not in UNOBSERVABLE)))
-def test_a_stream_and_a_trace_say_what_the_whole_record_says(fault):
-    rng = np.random.default_rng((3, FAULTS.index(fault)))
-    case = broken(drawn(rng, ()), fault, rng)
-    make = calibrators(case)["filter, mismatch"]
-    (found, estimate), traced, (found_live, live) = (outcome(case, make, path) for path in ("whole", "trace", "stream"))
-    assert found != "wrong" and traced == (found, estimate)
-    # a stream has means between samples, which do not tell in which of them a load was switched: its doubt may differ a little
-    if isinstance(live, Estimate):
-        sds = {name: getattr(estimate, name) for name in ("sd_q_mobile", "sd_r_o")}
-        assert {name: getattr(live, name) for name in sds} == pytest.approx(sds, rel=0.01)
-        live = replace(live, **sds)
-    assert (found_live, live) == (found, estimate)
 
 
 @pytest.mark.parametrize(
-    ("kind", "more"),
+    "more",
     [
-        (LeastSquares, {}),
-        (LeastSquares, {"voltage_noise_V": 0.01}),
-        (LeastSquares, {"mismatch_V": 0.02}),
-        (LeastSquares, {"nuisance": {"kn": 0.2, "offset_V": 0.01}}),
-        *((kind, {"parameters": [name]}) for kind in (LeastSquares, ExtendedKalmanFilter) for name in ("q_mobile", "r_o")),
+        {},
+        {"voltage_noise_V": 0.01},
+        {"mismatch_V": 0.02},
+        {"nuisance": {"kn": 0.2, "offset_V": 0.01}},
+        {"parameters": ["q_mobile"]},
+        {"parameters": ["r_o"]},
     ],
 )
 @pytest.mark.parametrize("soc", sweep(0.8, 0.4, 0.93))
-def test_no_estimator_settles_on_a_start_that_is_not_full_and_that_nobody_told(kind, more, soc):
+def test_no_estimator_settles_on_a_start_that_is_not_full_and_that_nobody_told(more, soc):
     case = simulated(np.random.default_rng(int(100 * soc)), soc, rest_s=120)
     # of one that finds one parameter the other one is right
-    estimator = kind(thermal=True, cell=NEW_CELL.replace(q_mobile=case.q_mobile, r_o=case.r_o), **more)
+    estimator = LeastSquares(thermal=True, cell=NEW_CELL.replace(q_mobile=case.q_mobile, r_o=case.r_o), **more)
     for record in (case, case.part(119, len(case.time_s))):
         estimate = estimator.estimate(record)
         assert not estimate.settled and estimate.reason.startswith("The record starts at")
@@ -495,18 +445,17 @@ def test_nor_is_one_with_constants_that_were_fitted_to_the_wrong_discharges(fitt
         return
     cut_off_V = 3.56 if fitted == "halves, as if whole" else 2.7
     fit = fitted_wrongly(FITTED[fitted], cut_off_V)
-    for method in ("least-squares", "kalman"):
-        for discharge in discharges("B0006")[6::64]:
-            on_s, end_s = discharge.load_on_time_s, discharge.eod_time_s(cut_off_V)
-            for share in (0.25, 0.5, 0.75, 1.0):
-                record = begun(discharge, share, cut_off_V) if share < 1.0 else discharge
-                try:
-                    found = calibrated(record, Settings(cell=fit, method=method), samples=100)
-                except ValueError as error:  # takes more charge than a cell that was fitted when old ever holds
-                    assert fitted == "old" and "beyond the upper bound" in str(error)
-                    continue
-                wrong = abs(found.predicted_eod_time_s - end_s) > WRONG_SHARE * (end_s - on_s)
-                assert not (found.settled and wrong), f"{method}: {found}"
+    for discharge in discharges("B0006")[6::64]:
+        on_s, end_s = discharge.load_on_time_s, discharge.eod_time_s(cut_off_V)
+        for share in (0.25, 0.5, 0.75, 1.0):
+            record = begun(discharge, share, cut_off_V) if share < 1.0 else discharge
+            try:
+                found = calibrated(record, Settings(cell=fit), samples=100)
+            except ValueError as error:  # takes more charge than a cell that was fitted when old ever holds
+                assert fitted == "old" and "beyond the upper bound" in str(error)
+                continue
+            wrong = abs(found.predicted_eod_time_s - end_s) > WRONG_SHARE * (end_s - on_s)
+            assert not (found.settled and wrong), found
 
 
 @pytest.mark.parametrize(

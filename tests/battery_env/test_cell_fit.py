@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import Legendre
 
-from battery_env import CellParameters, Estimate, ExtendedKalmanFilter, LeastSquares, fit_cell, forecast
+from battery_env import CellParameters, Estimate, LeastSquares, fit_cell, forecast
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
@@ -17,7 +17,7 @@ from battery_env.estimators.cell_fit import RATE_PRIOR_SD, CellFit, read_cell
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, JointFit
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
-from battery_env.lab.settings import METHODS, Settings
+from battery_env.lab.settings import Settings
 from battery_env.loads import constant as constant_load
 from battery_env.records import ChargeBefore, DischargeStart
 from battery_env.records.discharge import Discharge, load_nasa_discharges
@@ -265,15 +265,14 @@ class TestFiles:
             of_several = dataclasses.replace(fit, discharges=(slow, *fit.discharges))
             assert np.isnan(calibrate(record, cell=of_several).nominal_Ah)
 
-    @pytest.mark.parametrize("method", [method for method in METHODS if method != "policy"])
-    def test_settings_use_all_that_a_fit_knows(self, method, fit):
-        settings = Settings(cell=fit, method=method)
+    def test_settings_use_all_that_a_fit_knows(self, fit):
+        settings = Settings(cell=fit)
         assert settings.constants == fit.cell
         assert settings.resolved == (fit.cell.VEOD, fit.mismatch_V, fit.thermal, fit.usual_start)
         estimator, own = settings.calibrator(fit.cell), fit.calibrator()
         assert estimator.bounds == own.bounds and estimator.bounds["q_mobile"][1] == pytest.approx(1.2 * fit.cell.q_mobile)
         assert Settings(cell=OTHER).resolved.mismatch_V == 0.05
-        assert Settings(method=method).calibrator(NEW_CELL).bounds == LeastSquares().bounds == ExtendedKalmanFilter().bounds
+        assert Settings().calibrator(NEW_CELL).bounds == LeastSquares().bounds
         assert not Settings(cell=dataclasses.replace(fit, thermal=False)).resolved.thermal
 
     @pytest.mark.parametrize("other", [Settings.but, dataclasses.replace])

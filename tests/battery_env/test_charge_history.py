@@ -6,16 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import Discharge, Settings, calibrate, load_nasa_discharges, read_discharges
+from battery_env import Discharge, calibrate, load_nasa_discharges, read_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
 from battery_env.estimators.diagnosis.evidence import evidence_of, fault_reason, unseen_C
 from battery_env.estimators.diagnosis.gaps import doubtful_C
-from battery_env.estimators.estimator import OnlineEstimator
-from battery_env.records import ChargeBefore, ChargeHistory, Samples, Stream
+from battery_env.records import ChargeBefore, ChargeHistory, Samples
 from battery_env.records.load import switched_sd_C
 from tests.sweeps import sweep
 
-METHODS = ("least-squares", "kalman")
 TRUE_Q_C, TRUE_R_OHM, LOAD_A = 7000.0, 0.12, 2.0
 REAL = load_nasa_discharges("B0006")[99]
 
@@ -39,11 +37,10 @@ def is_right(found, q_mobile_C: float = TRUE_Q_C, r_o_ohm: float = TRUE_R_OHM) -
 
 
 class TestLoadOn:
-    @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("every_s", sweep(60.0, 1.0, 10.0, 120.0, 300.0, 600.0))
-    def test_its_doubt_covers_what_it_costs_however_far_apart_the_rows_are(self, every_s, method):
+    def test_its_doubt_covers_what_it_costs_however_far_apart_the_rows_are(self, every_s):
         for share in (0.02, 0.5, 0.98):
-            found = calibrate(discharged(every_s, 3.0 * every_s, share * every_s), method=method)
+            found = calibrate(discharged(every_s, 3.0 * every_s, share * every_s))
             assert found.record.history.load_on_C == pytest.approx(LOAD_A * every_s / 12.0**0.5, rel=0.05)
             assert found.sd_q_mobile_C > found.record.history.load_on_C
             assert abs(found.q_mobile_C - TRUE_Q_C) < 2.5 * found.sd_q_mobile_C
@@ -67,28 +64,18 @@ class TestLoadOn:
         assert mixed.settled and mixed.capacity_Ah == pytest.approx(plain.capacity_Ah)
         assert mixed.q_mobile_C == pytest.approx(plain.q_mobile_C, rel=1e-3)
 
-    @pytest.mark.parametrize("every_s", [10.0, 300.0])
-    def test_a_stream_that_begins_at_rest_doubts_it_likewise(self, every_s):
-        filter_ = Settings(method="kalman").calibrator()
-        assert isinstance(filter_, OnlineEstimator)
-        for sample in Stream.of(discharged(every_s, 900.0, 0.5 * every_s), 1.0).samples():
-            estimate = filter_.update(*sample)
-        assert abs(estimate.q_mobile - TRUE_Q_C) < 2.5 * estimate.sd_q_mobile
-        assert estimate.settled_q_mobile == (every_s < 200.0)
-
 
 class TestRest:
-    @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("rests_after", [True, False])
     @pytest.mark.parametrize("offset_A", sweep(0.05, -0.15, -0.05, -0.01, 0.01, 0.15))
-    def test_what_flows_there_is_counted_as_an_offset(self, offset_A, rests_after, method):
+    def test_what_flows_there_is_counted_as_an_offset(self, offset_A, rests_after):
         rest_s = 20.0 * np.arange(45)
         time_s = np.concatenate([REAL.time_s[0] - 900.0 + rest_s, REAL.time_s])
         voltage_V = np.append(np.full(45, REAL.voltage_V[0]), REAL.voltage_V)
         current_A = np.append(np.zeros(45), REAL.current_A) + offset_A
         kept = slice(None if rests_after else np.flatnonzero(current_A > 1.0)[-1] + 1)
         record = Discharge(time_s[kept], voltage_V[kept], current_A[kept])
-        plain, found = calibrate(REAL, method=method), calibrate(record, method=method)
+        plain, found = calibrate(REAL), calibrate(record)
         assert found.record.history.offset_A == pytest.approx(offset_A, abs=0.01)
         assert abs(found.q_mobile_C - plain.q_mobile_C) < 2.0 * found.sd_q_mobile_C
         is_large = abs(offset_A) > 0.03
@@ -119,41 +106,37 @@ def cycled(highest_V: float, last_A: float, rest_rows: int = 0, soc: float = 1.0
 
 
 class TestCharge:
-    @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize(
         ("soc", "highest_V"), sweep((0.97, 4.2), (0.97, 4.25), (0.92, 4.15), (0.85, 4.1), (0.7, 4.0), (0.7, 4.2))
     )
-    def test_one_that_did_not_taper_off_proves_no_full_cell(self, soc, highest_V, method):
+    def test_one_that_did_not_taper_off_proves_no_full_cell(self, soc, highest_V):
         # its voltage under load is that of a full cell with a larger resistance
-        (found,) = calibrate(cycled(highest_V, 3.0, soc=soc), method=method)
+        (found,) = calibrate(cycled(highest_V, 3.0, soc=soc))
         assert not found.settled and f"ended at {highest_V:.2f} V, still under 3 A" in found.reason
 
-    @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("rest_rows", sweep(0, 1, 100))
-    def test_one_that_tapered_off_proves_a_full_cell_without_a_rest(self, rest_rows, method):
+    def test_one_that_tapered_off_proves_a_full_cell_without_a_rest(self, rest_rows):
         table = cycled(4.2, 0.05, rest_rows)
-        (found,) = calibrate(table, method=method)
+        (found,) = calibrate(table)
         assert found.settled and is_right(found) and found.record.history.charge.tapered
         assert found.capacity_Ah == pytest.approx(found.drawn_Ah)
         # in whichever cycle it is counted
         counted = table.assign(cycle=np.where(table.current_A <= 0.0, 2, 1) if rest_rows == 0 else 1)
         assert len(read_discharges(counted)) == 1 and read_discharges(counted)[0].history.charge is not None
 
-    @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize(("last_A", "settled"), sweep((0.2, False), (0.03, True), (0.1, None), (0.3, False)))
-    def test_what_a_taper_left_is_in_the_standard_deviation(self, last_A, settled, method):
+    def test_what_a_taper_left_is_in_the_standard_deviation(self, last_A, settled):
         # about the charge that an exponential would have brought after its end
         left_C = last_A * 2000.0 / np.log(3.0 / last_A)
-        (found,) = calibrate(cycled(4.2, last_A, rest_rows=1), method=method)
+        (found,) = calibrate(cycled(4.2, last_A, rest_rows=1))
         assert found.record.history.charge.left_C == pytest.approx(left_C, rel=0.15)
         assert found.sd_q_mobile_C > left_C and found.capacity_Ah == pytest.approx(found.drawn_Ah)
         assert settled is None or found.settled_q_mobile == settled == ("had some left to take" not in found.reason)
 
-    @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("soc", sweep(0.98, 0.99, 0.97, 0.965))
-    def test_a_charge_cut_short_left_what_the_voltage_at_rest_shows(self, soc, method):
+    def test_a_charge_cut_short_left_what_the_voltage_at_rest_shows(self, soc):
         table = cycled(4.25, 3.0, rest_rows=100, soc=soc)
-        (found,), (alone,) = (calibrate(each, method=method) for each in (table, table[400:]))
+        (found,), (alone,) = (calibrate(each) for each in (table, table[400:]))
         left_C = found.q_mobile_C * (1.0 / soc - 1.0)
         assert found.sd_q_mobile_C == pytest.approx(np.hypot(alone.sd_q_mobile_C, left_C), rel=0.3)
 

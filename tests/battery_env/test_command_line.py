@@ -117,18 +117,14 @@ def test_nothing_is_fitted_to_bad_input_and_nothing_is_overwritten(
     assert Path("old.json").read_text() == Path("old_fit.png").read_text() == "precious"
 
 
-def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(recorded, tmp_path, terminal):
+def test_what_remains_of_a_discharge_in_progress_is_wide_without_a_prior(recorded, tmp_path, terminal):
     path = write(recorded.until(1500.0), tmp_path / "half.csv")
     shown = terminal.shows(path, status=3)
     assert "remaining" in shown and "Not settled: q_max is not known to 2 % yet" in shown
-    assert (
-        "battery-calibrate forecast FILE --life" in shown
-        and "calibrated by the Kalman filter" in shown
-        and "Ah   so far" in shown
-    )
-    assert terminal.row(path, status=3) == terminal.row(path, "--method", "kalman", status=3)
+    assert "battery-calibrate forecast FILE --life" in shown and "Ah   so far" in shown
+    alone = terminal.row(path, status=3)
     shown = terminal.shows(path, "--prior", 5460, 55, "--nominal", 2, "--out", tmp_path, status=3)
-    assert "Not settled: q_max rests on its prior" in shown and "--life" not in shown and "Kalman" not in shown
+    assert "Not settled: q_max rests on its prior" in shown and "--life" not in shown
     assert "2.01 A to go on" in shown and "Ah), predicted, of 2 Ah" in shown
     (row,) = pd.read_csv(tmp_path / "estimate.csv").to_dict(orient="records")
     end_s, whole_Ah = recorded.eod_time_s(2.7), recorded.loaded_part(2.7).charge_C / 3600.0
@@ -139,28 +135,30 @@ def test_what_remains_of_a_discharge_in_progress_needs_a_prior_or_the_filter(rec
     # which the moment of load-on widens a little
     by_end = row["sd_predicted_eod_time_s"] * row["future_current_A"] / 7200.0
     assert by_end < row["sd_state_of_health"] < 1.01 * by_end
-    filtered = terminal.row(path, "--method", "kalman", status=3)
-    assert filtered["settled"] is False and filtered["measured_eod_time_s"] is None
-    assert 1500.0 + filtered["remaining_s"] == pytest.approx(end_s, rel=0.2)
+    assert alone["settled"] is False and alone["measured_eod_time_s"] is None
+    assert 1500.0 + alone["remaining_s"] == pytest.approx(end_s, rel=0.2)
+    assert alone["sd_predicted_eod_time_s"] > 5.0 * row["sd_predicted_eod_time_s"]
 
 
-def test_the_record_chooses_the_method_and_not_what_comes_out(recorded):
+def test_what_is_usual_of_its_size_counts_in_progress_alone_and_where_nothing_is_known(recorded, monkeypatch):
+    told, calibrator = [], Settings.calibrator
+    monkeypatch.setattr(Settings, "calibrator", lambda *given: told.append(given[-1]) or calibrator(*given))
     running, whole = recorded.until(1500.0), recorded.loaded_part(2.7)
     rest = [running.time_s[-1] + 60.0 * np.arange(1.0, 5.0), np.linspace(3.7, 3.8, 4), np.zeros(4)]
     columns = (running.time_s, running.voltage_V, running.current_A)
     paused = Discharge(*map(np.append, columns, rest))
     pulses = simulate(np.where(np.arange(1600) % 200 < 100, 4.0, 1.0), 7000.0, 0.12, load_unit="current", thermal=True)
-    for record, options, method in (
-        (running, {}, "kalman"),
-        (running, {"nominal_Ah": 2.0}, "kalman"),
-        (running, {"prior_q_mobile_C": (5460.0, 55.0)}, "least-squares"),
-        (running, {"cell": NEW_CELL}, "least-squares"),
-        (paused, {}, "least-squares"),
-        (seen(pulses, slice(None)), {}, "kalman"),
-        (whole, {}, "least-squares"),
-        (whole, {"method": "kalman"}, "kalman"),
+    for record, options, counts in (
+        (running, {}, True),
+        (running, {"nominal_Ah": 2.0}, True),
+        (running, {"prior_q_mobile_C": (5460.0, 55.0)}, False),
+        (running, {"cell": NEW_CELL}, False),
+        (paused, {}, True),
+        (seen(pulses, slice(None)), {}, True),
+        (whole, {}, False),
     ):
-        assert battery_env.calibrate(record, **options).method == method, (method, options)
+        assert battery_env.calibrate(record, **options).method == "least-squares"
+        assert (told[-1] is not None) == counts, options
 
 
 def test_a_cell_of_more_than_twice_the_size_is_settled_at_1C_and_one_number_alone_at_C_over_30():
@@ -237,16 +235,15 @@ def test_the_version_is_that_of_the_package(capsys):
     assert capsys.readouterr().out == f"battery_env {battery_env.__version__}\n"
 
 
-@pytest.mark.parametrize("method", ["least-squares", "kalman"])
 @pytest.mark.parametrize(
     ("first", "more", "reason"),
     [(0, {}, "starts at 3.94 V"), (400, {"initial_soc": "rest"}, "does not start with a minute at rest")],
 )
-def test_no_capacity_is_stated_where_the_cell_did_not_start_full(first, more, reason, method):
+def test_no_capacity_is_stated_where_the_cell_did_not_start_full(first, more, reason):
     load_A = np.append(np.zeros(120), np.full(3000, 2.0))
     start = initial_state(6000.0, soc=0.7)
     low = simulate(load_A, 6000.0, 0.15, load_unit="current", thermal=True, initial=start, cut_off_V=2.65)
-    found = battery_env.calibrate(seen(low, slice(first, None)), nominal_Ah=2.0, method=method, **more)
+    found = battery_env.calibrate(seen(low, slice(first, None)), nominal_Ah=2.0, **more)
     assert found.drawn_Ah > 0.9 and reason in found.reason
     assert np.isnan([found.capacity_Ah, found.predicted_capacity_Ah, found.state_of_health]).all()
     assert "Ah   to 2.7 V; not the capacity, as not all of the charge is known" in str(found)
@@ -378,8 +375,8 @@ def test_results_among_the_records_are_no_records(recorded, tmp_path, terminal):
 class TestInPython:
     def test_files_tables_and_discharges_say_the_same_as_on_the_command_line(self, recorded, tmp_path, terminal):
         path = Path(write(Samples(recorded.time_s, recorded.voltage_V, -recorded.current_A), tmp_path / "cell.csv"))
-        row = terminal.row(path, "--nominal", 2, "--method", "kalman")
-        options = {"nominal_Ah": 2.0, "method": "kalman"}
+        row = terminal.row(path, "--nominal", 2, "--method", "policy")
+        options = {"nominal_Ah": 2.0, "method": "policy"}
         (of_file,), (of_table,) = (battery_env.calibrate(each, **options) for each in (path, pd.read_csv(path)))
         of_discharge = battery_env.calibrate(battery_env.read_discharges(path)[0], Settings(**options))
         for found in (of_file, of_table, of_discharge):
@@ -414,14 +411,6 @@ def test_the_temperature_is_the_first_one_measured_or_that_of_the_surroundings(r
         for more in ({"temperature_C": temperature_C}, *({"ambient temperature": each_C} for each_C in (20.0, 40.0)))
     ]
     assert r_o_ohm[0] == pytest.approx(r_o_ohm[1], rel=1e-3) and r_o_ohm[1] > r_o_ohm[2]
-
-
-def test_the_filter_follows_the_measured_temperature_unless_it_is_held(recorded):
-    warming = replace(recorded, temperature_C=np.linspace(20.0, 40.0, len(recorded.time_s)))
-    measured, held = (
-        calibrated(warming, Settings(method="kalman", **more)).row()["r_o_ohm"] for more in ({}, {"thermal": False})
-    )
-    assert measured < held
 
 
 def test_many_samples_are_averaged_and_say_the_same(recorded):

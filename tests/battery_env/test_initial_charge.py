@@ -80,11 +80,9 @@ def test_constants_whose_rest_does_not_rise_with_the_charge_do_not_tell_it():
 
 
 class TestCommandLine:
-    @pytest.mark.parametrize("method", ["least-squares", "kalman"])
-    def test_a_stated_charge(self, method, record, tmp_path, terminal):
-        options = [write(record, tmp_path / "record.csv"), "--method", method, "--mismatch", "0.02", "--nominal", "2"]
-        status = SETTLED if method == "kalman" else NOT_SETTLED
-        row = terminal.row(*options, "--initial-soc", "0.8", status=status)
+    def test_a_stated_charge(self, record, tmp_path, terminal):
+        options = [write(record, tmp_path / "record.csv"), "--mismatch", "0.02", "--nominal", "2"]
+        row = terminal.row(*options, "--initial-soc", "0.8", status=NOT_SETTLED)
         assert row["initial_soc"] == 0.8
         assert row["q_mobile_C"] == pytest.approx(6000.0, rel=0.02)
         # the capacity is that of a full cell
@@ -95,10 +93,9 @@ class TestCommandLine:
         assert "state initial_soc (--initial-soc)" in terminal.row(*options, status=NOT_SETTLED)["reason"]
         assert terminal.row(*options, "--initial-soc", "0.8,0.05", status=NOT_SETTLED)["sd_initial_soc"] == 0.05
 
-    @pytest.mark.parametrize("method", ["least-squares", "kalman"])
-    def test_a_rest(self, method, record, tmp_path, terminal):
-        path, options = tmp_path / "record.csv", ["--method", method, "--mismatch", "0.001", "--initial-soc", "rest"]
-        row = terminal.row(write(record, path), *options, status=SETTLED if method == "least-squares" else NOT_SETTLED)
+    def test_a_rest(self, record, tmp_path, terminal):
+        path, options = tmp_path / "record.csv", ["--mismatch", "0.001", "--initial-soc", "rest"]
+        row = terminal.row(write(record, path), *options, status=SETTLED)
         assert row["initial_soc"] == pytest.approx(0.8, abs=0.02) and 0.0 < row["sd_initial_soc"] < 0.02
         assert abs(row["q_mobile_C"] - 6000.0) < 3.0 * row["sd_q_mobile_C"] < 500.0
         row = terminal.row(write(record.part(REST_S - 20, len(record.time_s)), path), *options, status=NOT_SETTLED)

@@ -187,23 +187,19 @@ class TestStart:
         with pytest.raises(ValueError, match="a full cell at rest shows"):
             track_life(lasts, cut_off_V=2.7)
 
-    @pytest.mark.parametrize("method", ["least-squares", "kalman"])
     @pytest.mark.parametrize(("charge_V", "rest_rows"), sweep((None, 20), (4.11, 0)))
-    def test_no_fit_rejects_its_own_discharges(self, charge_V, rest_rows, method, recwarn):
+    def test_no_fit_rejects_its_own_discharges(self, charge_V, rest_rows, recwarn):
         own = regular_life(0.88, charge_V, rest_rows, count=2)
         fit = fit_cell(own)
         for each in (*own, regular_life(0.88, charge_V, rest_rows)[-1]):
-            found = calibrate(each, cell=fit, method=method)
+            found = calibrate(each, cell=fit)
             assert "tarts at" not in found.reason and found.capacity_Ah == pytest.approx(found.drawn_Ah)
             assert "tarts at" not in fit.calibrator().estimate(each.loaded_part(2.7)).reason
-        lower = calibrate(partly_charged(0.7, None, 2.0, rest_rows), cell=fit, method=method)
+        lower = calibrate(partly_charged(0.7, None, 2.0, rest_rows), cell=fit)
         assert "where the discharges of its life, or of its fit, do at" in lower.reason and np.isnan(lower.capacity_Ah)
         # a fit of an older release does not tell
         old = replace(fit, usual_start=None)
-        assert (
-            calibrate(own[0], cell=old, method=method).reason != calibrate(own[0], cell=fit, method=method).reason
-            or not charge_V
-        )
+        assert calibrate(own[0], cell=old).reason != calibrate(own[0], cell=fit).reason or not charge_V
 
     def test_bundled_lives_start_as_full_cells_do(self):
         for cell in ("B0005", "B0006"):

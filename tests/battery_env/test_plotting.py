@@ -108,8 +108,8 @@ def test_the_cycles_of_files_are_the_axis_and_one_method_is_drawn():
     figure = plot_life(table)
     assert points_of(figure)[0].get_xdata().tolist() == [2.0, 5.0, 9.0] and figure.axes[-1].get_xlabel() == "cycle"
     assert plot_life(table.drop(columns="cell").assign(cycle=None)).axes[-1].get_xlabel() == "discharge"
-    with pytest.raises(ValueError, match="one method, got kalman and least-squares"):
-        plot_life(table.assign(method=["kalman", "kalman", "least-squares"]))
+    with pytest.raises(ValueError, match="one method, got policy and least-squares"):
+        plot_life(table.assign(method=["policy", "policy", "least-squares"]))
 
 
 def test_a_name_has_one_colour_in_all_figures():

@@ -72,7 +72,8 @@ class TestOwnCell:
 
     def test_a_stream_is_followed_with_its_constants(self, own, tmp_path):
         (trajectory, _), stream = own, self.estimator(cell=self.CELL)
-        np.testing.assert_array_equal(stream.now().parameters[:2], [self.CELL.q_mobile, self.CELL.r_o])
+        cell = stream.at_last_sample()[1]
+        assert (cell.q_mobile[0], cell.r_o[0]) == (self.CELL.q_mobile, self.CELL.r_o)
         for sample in zip(trajectory.voltage_V[:181].tolist(), trajectory.current_A[:181].tolist(), strict=True):
             estimate = stream.update(*sample, 1.0)
         part = Samples(*(column[:181] for column in (trajectory.time_s, trajectory.voltage_V, trajectory.current_A)))
@@ -80,7 +81,8 @@ class TestOwnCell:
         assert estimate.q_mobile != pytest.approx(self.estimator().estimate(part).q_mobile, rel=1e-3)
         saved, again = stream.save(tmp_path / "stream.npz"), self.estimator(cell=CellParameters.of_mapping(asdict(self.CELL)))
         again.load(saved)
-        assert again.now().cell == self.CELL and again.now().state.tolist() == stream.now().state.tolist()
+        (model, cell), (_, before) = again.at_last_sample(), stream.at_last_sample()
+        assert model.cell == self.CELL and cell.state.tolist() == before.state.tolist()
         with pytest.raises(ValueError, match="cell"):
             self.estimator().load(saved)
 

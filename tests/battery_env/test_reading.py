@@ -509,11 +509,10 @@ def test_a_voltage_below_the_cut_off_is_refused_with_one_that_is_reached(lowest_
 
 
 @pytest.mark.parametrize("gain", [0.5, 0.97, 1.03, 2.0])
-@pytest.mark.parametrize("method", ["least-squares", "kalman"])
-def test_another_count_of_the_tester_is_a_doubt_of_its_size(gain, method):
+def test_another_count_of_the_tester_is_a_doubt_of_its_size(gain):
     discharge = read(TABLE.assign(**{"Capacity(mAh)": 1e3 * gain * COUNTED_AH}), "the tester counted")
     assert discharge.history.uncounted_C == pytest.approx(abs(gain - 1.0) * 3600.0 * COUNTED_AH[-1], rel=0.1)
-    found = calibrate(discharge, method=method)
+    found = calibrate(discharge)
     assert found.sd_q_mobile_C > 0.95 * discharge.history.uncounted_C and not found.settled_q_mobile
     assert "the tester counted another charge" in found.reason
 

@@ -1,11 +1,11 @@
-"""Streams: sample by sample, with gaps and rests, stopped and resumed, of filters and policies."""
+"""Streams of policies: sample by sample, with gaps and rests, stopped and resumed."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from battery_env import ExtendedKalmanFilter, PolicyEstimator, simulate
+from battery_env import PolicyEstimator, simulate
 from tests.policies import Always
 
 NOISE_V = 0.005
@@ -26,43 +26,30 @@ def policy_estimator(**more):
     return PolicyEstimator(Always(-0.2, 0.1), "BatteryVoltageJoint-v0", **more)
 
 
-@pytest.fixture(params=[lambda: ExtendedKalmanFilter(thermal=True), policy_estimator], ids=["filter", "policy"])
-def make(request):
-    return request.param
-
-
 @pytest.fixture(scope="module")
 def whole():
     return measured()
 
 
 class TestSamples:
-    def test_voltages_that_are_missing_leave_the_answer_right(self, whole):
-        gone = whole.voltage_V.copy()
-        gone[np.random.default_rng(1).random(len(gone)) < 0.5] = np.nan
-        gone[0], gone[1000:1300] = whole.voltage_V[0], np.nan
-        estimate = follow(ExtendedKalmanFilter(thermal=True), replace(whole, voltage_V=gone))
-        assert estimate.settled and abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile
-        assert abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o
-
-    def test_the_first_voltage_may_not_be_missing(self, make):
+    def test_the_first_voltage_may_not_be_missing(self):
         with pytest.raises(ValueError, match=r"voltage_V must be finite, got nan. .*tells whether the cell is full"):
-            make().update(np.nan, 2.0, 0.0)
+            policy_estimator().update(np.nan, 2.0, 0.0)
 
-    def test_a_week_of_rest_is_one_sample_and_a_gap_under_load_is_refused(self, make):
-        estimator = make()
+    def test_a_week_of_rest_is_one_sample_and_a_gap_under_load_is_refused(self):
+        estimator = policy_estimator()
         estimator.update(4.19, 2.0, 0.0)
         estimator.update(4.0, 2.0, 600.0)
         with pytest.raises(ValueError, match=r"within 0.001 .. 600 s, got 3600"):
             estimator.update(3.9, 2.0, 3600.0)
         estimator.update(3.9, 0.0, 60.0)
         estimator.update(np.nan, 0.0, 604_800.0)
-        assert (1.0 - estimator.soc) * estimator.now().parameters[0] == pytest.approx(2.0 * 660.0)
+        assert (1.0 - estimator.soc) * estimator.at_last_sample()[1].q_mobile[0] == pytest.approx(2.0 * 660.0)
         with pytest.raises(ValueError, match=r"within 0.001 .. 604800 s"):
             estimator.update(4.0, 0.0, 700_000.0)
 
-    def test_charge_that_was_drawn_may_be_put_back_and_no_more(self, make):
-        estimator = make()
+    def test_charge_that_was_drawn_may_be_put_back_and_no_more(self):
+        estimator = policy_estimator()
         estimator.update(4.19, 2.0, 0.0)
         estimator.update(4.0, -1.0, 600.0)
         for _ in range(2):
@@ -70,11 +57,6 @@ class TestSamples:
         estimator.update(4.19, -2.0, 60.0)
         with pytest.raises(ValueError, match="current_A is positive in discharge, but this record draws -"):
             estimator.update(4.19, -2.0, 600.0)
-
-    def test_charge_that_flows_back_is_modelled(self):
-        load_A = np.where(np.arange(20_000) % 300 < 200, 2.5, -1.0)
-        estimate = follow(ExtendedKalmanFilter(thermal=True), measured(load_A))
-        assert estimate.settled and abs(estimate.q_mobile - 6000.0) < 3.0 * estimate.sd_q_mobile
 
     @pytest.mark.parametrize(
         ("sample", "error", "message"),
@@ -96,8 +78,8 @@ class TestSamples:
             ((3.7, 2.0, 1000.0), ValueError, "dt_s, .* got 1000.0. Give it in seconds, not in hours or milliseconds"),
         ],
     )
-    def test_what_cannot_be_meant_is_refused_and_changes_nothing(self, make, sample, error, message):
-        estimator, untouched, good = make(), make(), (4.1, 2.0, 1.0)
+    def test_what_cannot_be_meant_is_refused_and_changes_nothing(self, sample, error, message):
+        estimator, untouched, good = policy_estimator(), policy_estimator(), (4.1, 2.0, 1.0)
         if "dt_s" not in message:  # which the first sample does not need
             with pytest.raises(error, match=f"^{message}"):
                 estimator.update(*sample)
@@ -107,39 +89,36 @@ class TestSamples:
             estimator.update(*sample)
         assert repr(estimator.update(*good)) == repr(untouched.update(*good))
 
-    def test_kelvin_is_refused_and_a_policy_takes_no_temperature(self):
-        with pytest.raises(ValueError, match=r"temperature_C must lie within .* not in kelvin"):
-            ExtendedKalmanFilter().update(4.19, 2.0, 0.0, 293.0)
-        with pytest.raises(TypeError, match="temperature_C must be a number, got 'warm'"):
-            ExtendedKalmanFilter().update(4.19, 2.0, 0.0, "warm")
+    def test_a_policy_takes_no_temperature(self):
         with pytest.raises(ValueError, match="a policy takes no temperature"):
             policy_estimator().update(4.19, 2.0, 0.0, 20.0)
 
 
 class TestModel:
     def test_state_of_charge_voltage_and_time_left(self, whole):
-        filter_, half = ExtendedKalmanFilter(thermal=True, prior_q_mobile_C=(6050.0, 60.0)), len(whole.time_s) // 2
-        follow(filter_, whole.part(0, half))
-        true = whole.state[half - 1, 4:6].sum() / 6000.0
-        assert filter_.soc == pytest.approx(true, abs=0.01)
-        assert filter_.voltage_V == pytest.approx(whole.voltage_V[half - 1], abs=0.02)
-        left = filter_.remaining(2.0)
-        assert 5.0 < left.sd_s < 60.0 and abs(left.time_s - (len(whole.time_s) - half)) < 3.0 * left.sd_s
-        low_s, median_s, high_s = left.quantile_s()
-        assert median_s == left.time_s and high_s - low_s == pytest.approx(3.29 * left.sd_s, rel=1e-3)
-        assert filter_.remaining(1.0).time_s > 1.9 * left.time_s
-        assert filter_.remaining(8.0, load_unit="power").time_s < left.time_s
-        assert filter_.remaining(0.0).time_s == np.inf
+        estimator, half = PolicyEstimator(Always(0.0, 0.0), "BatteryVoltageJoint-v0"), len(whole.time_s) // 2
+        estimate = follow(estimator, whole.part(0, half))
+        model, cell = estimator.at_last_sample()
+        assert (cell.q_mobile[0], cell.r_o[0]) == (estimate.q_mobile, estimate.r_o)
+        drawn_C = whole.current_A[: half - 1].sum()
+        assert estimator.soc == pytest.approx(1.0 - drawn_C / estimate.q_mobile, rel=1e-6)
+        alike = simulate(2.0, estimate.q_mobile, estimate.r_o, load_unit="current", cell=model.cell)
+        assert estimator.voltage_V == pytest.approx(alike.voltage_V[half - 1], abs=1e-6)
+        left = estimator.remaining(2.0)
+        assert left.time_s == pytest.approx(len(alike.time_s) - half, abs=1.5) and np.isnan(left.sd_s)
+        assert estimator.remaining(1.0).time_s > 1.9 * left.time_s
+        assert estimator.remaining(8.0, load_unit="power").time_s < left.time_s
+        assert estimator.remaining(0.0).time_s == np.inf
 
     def test_an_array_that_ends_before_the_discharge_is_refused(self, whole):
-        filter_ = ExtendedKalmanFilter(thermal=True)
-        follow(filter_, whole.part(0, 600))
-        left_s = filter_.remaining(2.0).time_s
-        assert filter_.remaining(np.full(int(left_s) + 100, 2.0)).time_s == left_s
+        estimator = policy_estimator()
+        follow(estimator, whole.part(0, 600))
+        left_s = estimator.remaining(2.0).time_s
+        assert estimator.remaining(np.full(int(left_s) + 100, 2.0)).time_s == left_s
         with pytest.raises(ValueError, match=r"load ends after 600 s, before .* a Load of battery_env\.loads"):
-            filter_.remaining(np.full(600, 2.0))
+            estimator.remaining(np.full(600, 2.0))
         # a week of rest is none
-        assert filter_.remaining(np.zeros(604_801)).time_s == np.inf
+        assert estimator.remaining(np.zeros(604_801)).time_s == np.inf
 
 
 class TestPolicies:
@@ -161,13 +140,9 @@ class TestPolicies:
 
 
 class TestFiles:
-    @pytest.mark.parametrize(
-        "make",
-        [lambda: ExtendedKalmanFilter(thermal=True), policy_estimator, lambda: policy_estimator(nuisance=0.2, reading_s=5.0)],
-        ids=["filter", "policy", "sure policy"],
-    )
-    def test_stopping_and_going_on_changes_nothing(self, make, whole, tmp_path):
-        one, other = make(), make()
+    @pytest.mark.parametrize("options", [{}, {"nuisance": 0.2, "reading_s": 5.0}], ids=["policy", "sure policy"])
+    def test_stopping_and_going_on_changes_nothing(self, options, whole, tmp_path):
+        one, other = policy_estimator(**options), policy_estimator(**options)
         record = whole.part(0, 800)
         follow(one, record.part(0, 500))
         file = one.save(tmp_path / "state")
@@ -176,10 +151,7 @@ class TestFiles:
         assert repr(follow(one, record.part(500, 800))) == repr(follow(other, record.part(500, 800)))
         assert one.soc == other.soc and list(tmp_path.iterdir()) == [file]
 
-    @pytest.mark.parametrize(
-        "make_other", [lambda: ExtendedKalmanFilter(mismatch_V=0.05), lambda: PolicyEstimator.pretrained(recorded=True)]
-    )
-    def test_what_does_not_fit_is_refused(self, make, make_other, tmp_path):
-        file = make().save(tmp_path / "state")
+    def test_what_does_not_fit_is_refused(self, tmp_path):
+        file = policy_estimator().save(tmp_path / "state")
         with pytest.raises(ValueError, match=r"is of an estimator with .*make one with the same arguments"):
-            make_other().load(file)
+            PolicyEstimator.pretrained(recorded=True).load(file)

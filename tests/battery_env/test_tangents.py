@@ -11,7 +11,6 @@ from battery_env.electrochemistry.tangents import (
     PolynomialDerivatives,
     least_q,
     step_with_tangents,
-    voltage_curvature,
     voltage_tangents,
 )
 
@@ -32,16 +31,12 @@ def after(steps, q, r_o, thermal, current_A=2.0):
 @pytest.mark.parametrize("thermal", [False, True])
 @pytest.mark.parametrize("steps", [50, 1500, 2800])
 class TestOneCell:
-    def test_voltage_to_second_order_along_them(self, steps, thermal):
+    def test_voltage_along_them(self, steps, thermal):
         state, tangents = after(steps, 6000.0, 0.15, thermal)
         dq = 0.5
-        more, here, less = (
-            float(voltage(state[0] + s * dq * tangents[0, BY_Q], 6000.0 + s * dq, cell=CELL)) for s in (1.0, 0.0, -1.0)
-        )
+        more, less = (float(voltage(state[0] + s * dq * tangents[0, BY_Q], 6000.0 + s * dq, cell=CELL)) for s in (1.0, -1.0))
         by_q, by_r_o = voltage_tangents(state, tangents, 6000.0, thermal, PACKED, DERIVATIVES)
         assert by_q == pytest.approx((more - less) / (2.0 * dq), rel=1e-4)
-        curvature = voltage_curvature(state, tangents, 6000.0, PACKED, DERIVATIVES)
-        assert curvature == pytest.approx((more - 2.0 * here + less) / dq**2, rel=1e-3, abs=1e-13)
         more, less = (float(voltage(state[0] + s * 1e-4 * tangents[0, BY_R], 6000.0, cell=CELL)) for s in (1.0, -1.0))
         assert by_r_o == pytest.approx((more - less) / 2e-4, rel=1e-6)
 

@@ -71,7 +71,7 @@ def test_a_wrong_current_goes_into_both_parameters(tmp_path, monkeypatch):
     assert error["closed form", "none", "q_mobile"] < 1e-9 and error["closed form", "none", "r_o"] < 1e-9
     # the current scales R_o; charges are measured
     assert error["closed form", "current +1 %", "r_o"] == pytest.approx(100.0 * (1.0 - 1.0 / 1.01), rel=1e-6)
-    assert error["Kalman filter", "none", "q_mobile"] < 0.5 < error["Kalman filter", "current +1 %", "q_mobile"] < 3.0
+    assert error["Kalman filter", "none", "q_mobile"] < 0.8 < error["Kalman filter", "current +1 %", "q_mobile"] < 3.0
 
 
 @pytest.mark.attacks

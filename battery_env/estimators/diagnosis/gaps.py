@@ -101,7 +101,7 @@ def _open(evidence: Row, voltage: float, current: float, expected_V: float, char
     if gap.samples > 0.0:
         _doubt(gap)
     gap.length_s, gap.end_s, gap.charge_C, gap.samples = duration, evidence.time_s, charge_C, 1.0
-    # the filter gives way to the samples after a gap, so that these are compared with what it had expected before
+    # samples after a gap are compared with what was expected before it
     gap.fall_V = usual.expected_V - expected_V
     steady_s = evidence.time_s - duration - evidence.examined.jump_s
     if steady_s >= STEADY_S:

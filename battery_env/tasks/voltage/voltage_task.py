@@ -209,7 +209,7 @@ class VoltageTask(CalibrationTask):
             if not low <= value <= high:
                 raise ValueError(
                     f"{name} of cell must lie within {low:g} .. {high:g}, where the task looks for it, got {value:g}. "
-                    "Take least squares or the filter for such cells."
+                    "Take least squares for such cells."
                 )
 
     @classmethod
