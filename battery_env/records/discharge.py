@@ -117,13 +117,13 @@ class Discharge:
             raise RecordError(
                 f"time_s must span {least_s:g} .. {most_s:g} s, got {duration_s:g} s, too "
                 f"{'short' if duration_s < least_s else 'long'} for a discharge",
-                *units,
+                units,
             )
         check_drawn_charge(drawn_charge_C(self))
         if self.charge_C > Q_MOBILE.limits[1]:
             raise RecordError(
                 f"this record draws {self.charge_C:.3g} C, more than the {Q_MOBILE.limits[1]:g} C that a cell may hold",
-                MILLIAMPERE,
+                [MILLIAMPERE],
             )
 
     def _derived(self, **changes: Any) -> Discharge:
@@ -273,7 +273,7 @@ class Discharge:
                 least_V = float(f"{under_load_V[under_load_V > 0.0].min(initial=cut_off_V):.4g}")
                 raise RecordError(
                     f"all of the voltage under load{rest} lies below the cut-off of {cut_off_V:g} V",
-                    Advice("State where the discharge ends", "cut_off_V", least_V),
+                    [Advice("State where the discharge ends", "cut_off_V", least_V)],
                 )
             raise ValueError(
                 f"only {len(time_s)} samples lie between load-on at {start_s:g} s and {cut_off_V:g} V or the end of the load; "

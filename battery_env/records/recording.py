@@ -23,15 +23,14 @@ class Recording(NamedTuple):
         try:
             if (count := len(self.arrays["time_s"])) < LEAST_SAMPLES:
                 export = Advice("If each is the end of a step, export all that was recorded")
-                raise RecordError(f"{count} rows are no discharge", export)
+                raise RecordError(f"{count} rows are no discharge", [export])
             made = Discharge(**self.arrays, meta=self.meta)
             drawn_Ah = made.charge_C / 3600.0
             if drawn_Ah > _MOST_WITHOUT_UNIT_AH and self.origin.leaves_open("current"):
                 raise RecordError(
                     f"the current has no unit, and draws {drawn_Ah:.4g} Ah if it is in A, {drawn_Ah:.4g} mAh if it is in mA: "
                     f"above {_MOST_WITHOUT_UNIT_AH:g} Ah state which",
-                    Advice("mA? Then", "units", {"current": "mA"}),
-                    Advice("A? Then", "units", {"current": "A"}),
+                    [Advice(f"{unit}? Then", "units", {"current": unit}) for unit in ("mA", "A")],
                 )
             return made
         except RecordError as error:

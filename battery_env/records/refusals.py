@@ -62,7 +62,8 @@ class Origin:
         options[advice.option] = value
         if self.source == TABLE:
             return f"read_discharges(table, {', '.join(f'{name}={each!r}' for name, each in options.items())})"
-        return shlex.join(["battery-calibrate", self.source, *(word for each in options.items() for word in _words(*each))])
+        words = [word for name, each in options.items() for word in _words(name, each)]
+        return shlex.join(["battery-calibrate", self.source, *words])
 
 
 def _words(option: str, value: Any) -> list[str]:
@@ -85,8 +86,10 @@ class RecordError(ValueError):
     :param origin: the file, whose commands are shown; ``None``: options are named alone
     """
 
-    def __init__(self, problem: object, *advice: Advice, table: Sequence[str] = (), origin: Origin | None = None) -> None:
-        super().__init__(problem, *advice)
+    def __init__(
+        self, problem: object, advice: Sequence[Advice] = (), table: Sequence[str] = (), origin: Origin | None = None
+    ) -> None:
+        super().__init__(problem, advice, table, origin)
         self.problem, self.advice, self.table, self.origin = str(problem).rstrip("."), advice, table, origin
 
     @classmethod
@@ -97,7 +100,7 @@ class RecordError(ValueError):
     def of(self, origin: Origin, table: Sequence[str] | None = None) -> RecordError:
         """The same with the commands of a file, and without advice on what that file tells itself."""
         advice = [each for each in self.advice if origin.leaves_open(each.question)]
-        return RecordError(self.problem, *advice, table=self.table if table is None else table, origin=origin)
+        return RecordError(self.problem, advice, self.table if table is None else table, origin)
 
     def __str__(self) -> str:
         said = [self.problem, *(each.text for each in self.advice if not each.option)]

@@ -116,7 +116,7 @@ def _implausible(name: str, value: float, where: str = "") -> RecordError:
     low, high, unit = PLAUSIBLE[name]
     # what is too low is of no other unit, as a negative voltage of a half cell
     advice = _BEYOND[name] if value > high or low == -high else ()
-    return RecordError(f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}", *advice)
+    return RecordError(f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}", advice)
 
 
 def check_record(record: Record, least_samples: int = 1) -> Samples:
@@ -152,7 +152,7 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
             )
         raise RecordError(
             f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s",
-            Advice(advice),
+            [Advice(advice)],
         )
     return Samples(**arrays)
 
@@ -204,7 +204,7 @@ def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
     if not charge_C > least_C:
         raise RecordError(
             f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total: flip the sign of it",
-            *SIGNS,
+            SIGNS,
         )
 
 
@@ -215,7 +215,7 @@ def check_cut_off(cut_off_V: float) -> float:
         is_in_mV = 0.0 < 1e-3 * cut_off_V <= most_V
         advice = [Advice("Give the cut-off in V, not in mV", "cut_off_V", 1e-3 * cut_off_V)] if is_in_mV else []
         raise RecordError(
-            f"the cut-off must be a voltage of one cell, above 0 and up to {most_V:g} V, got {cut_off_V:g}", *advice
+            f"the cut-off must be a voltage of one cell, above 0 and up to {most_V:g} V, got {cut_off_V:g}", advice
         )
     return cut_off_V
 

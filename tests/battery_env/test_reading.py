@@ -196,7 +196,7 @@ REFUSED = {
     "a clock that is put back": (named("Date", "U", "I").assign(Date=PUT_BACK), "the clock goes back: row .*dates in UTC"),
     "tests one after another": (
         pd.concat([CYCLE, CYCLE]),
-        "the clock goes back: row 393 .*Number tests in a column of the cycle",
+        "the clock goes back: row 393 .*Number tests in a column",
     ),
     "two channels in turn": (
         pd.concat([TABLE, TABLE.assign(voltage=TABLE["voltage"] - 0.05)]).sort_values("time", kind="stable"),

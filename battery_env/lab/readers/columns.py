@@ -129,7 +129,7 @@ class Recognised(NamedTuple):
         choices = range(max(map(len, named.values())))
         likely = [{each: names[min(n, len(names) - 1)] for each, names in named.items()} for n in choices]
         advice = [Advice("Name the columns, or their places", "columns", each) for each in likely]
-        raise RecordError(f"no column for the {', the '.join(self.missing)}", *advice)
+        raise RecordError(f"no column for the {', the '.join(self.missing)}", advice)
 
 
 def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]]) -> Recognised:

@@ -203,7 +203,7 @@ def _nothing_drawn(rows: pd.DataFrame) -> RecordError:
     begin_V, end_V = voltage_V[current_A < 0.0][[0, -1]] if (current_A < 0.0).any() else (0.0, 0.0)
     if end_V > begin_V:
         return RecordError(f"there is no discharge, but a charge of {charged_Ah:.4g} Ah, from {begin_V:.2f} to {end_V:.2f} V")
-    return RecordError("there is no discharge, as no charge is drawn: check the sign of the current", *SIGNS)
+    return RecordError("there is no discharge, as no charge is drawn: check the sign of the current", SIGNS)
 
 
 def _bounds(rows: pd.DataFrame) -> list[int]:

@@ -75,7 +75,7 @@ def _check_twins(found: dict[str, FloatArray], columns: Mapping[str, Column]) ->
             names = [columns[each].name for each in (quantity, key)]
             raise RecordError(
                 f"both {' and '.join(map(repr, names))} may be the {quantity}, and they differ",
-                *(Advice(f"If it is {name!r}", "columns", {quantity: name}) for name in names),
+                [Advice(f"If it is {name!r}", "columns", {quantity: name}) for name in names],
             )
         if len(others) > len(values):
             found[quantity] = found[key]
@@ -129,7 +129,7 @@ def _one_cell(values: pd.Series, column: Column) -> FloatArray:
     if len(cells) > 1:
         raise RecordError(
             f"{column.name!r} names {len(cells)} cells ({', '.join(cells[:3])}): give each a file, or in Python a table",
-            Advice("If they are one, leave the column out", "ignore", [column.name]),
+            [Advice("If they are one, leave the column out", "ignore", [column.name])],
         )
     return np.zeros(len(values))
 
@@ -260,7 +260,7 @@ def without_incomplete(rows: pd.DataFrame, open_questions: Collection[str]) -> p
     faults["there is no measurement of a cell"] = ~is_measured
     told = "; ".join(f"{fault} in row {place_of(rows, bad)}" for fault, bad in faults.items() if bad.any())
     if is_faulty.sum() > most:
-        raise RecordError(told, Advice(f"Of {len(rows)} rows at most {most} are left out: remove these, or fill them in"))
+        raise ValueError(f"{told}. Of {len(rows)} rows at most {most} are left out: remove these, or fill them in")
     if told:
         say(f"left out, as {told}")
     kept = rows[is_measured & ~is_faulty]
@@ -284,10 +284,9 @@ def in_order(rows: pd.DataFrame) -> pd.DataFrame:
     back = (step_s < 0.0) & ~changes(rows, "cycle")
     if back.any():
         first = int(np.argmax(back))
-        raise RecordError(
-            f"the clock goes back: row {place_of(rows, back)} is at {time_s[first]:g} s, after {time_s[first - 1]:g} s",
-            Advice("Give the time since the start of the test, or dates in UTC"),
-            Advice("Number tests in a column of the cycle, or give each a file"),
+        raise ValueError(
+            f"the clock goes back: row {place_of(rows, back)} is at {time_s[first]:g} s, after {time_s[first - 1]:g} s. Give "
+            "the time since the start of the test, or dates in UTC. Number tests in a column of the cycle, or give each a file"
         )
     same = step_s == 0.0
     is_switched = np.isin(np.arange(len(rows)), switches(rows["current"].to_numpy()) + 1)

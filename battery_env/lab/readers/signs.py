@@ -7,7 +7,7 @@ import pandas as pd
 
 from battery_env.lab.readers.columns import Recognised
 from battery_env.records import LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE, switches
-from battery_env.records.refusals import Advice, RecordError
+from battery_env.records.refusals import RecordError
 from battery_env.records.samples import SIGNS
 
 #: What changes the voltage by more than this share of its range is much.
@@ -42,7 +42,7 @@ def with_signed_current(rows: pd.DataFrame, known: Recognised, is_negative: bool
             raise RecordError(
                 "whether the current of a discharge is positive or negative cannot be told, as words and jumps of the voltage "
                 f"do not say so clearly, or contradict each other ({words:.2f}, {jumps:.2f})",
-                *SIGNS,
+                SIGNS,
             )
     return rows.assign(current=-current_A) if is_negative else rows
 
@@ -78,8 +78,8 @@ def _refuse_unsigned(rows: pd.DataFrame) -> None:
     rise_V = voltage_V[np.maximum(end - 1, begin)] - voltage_V[first]
     rise_V[is_rest | (most_A < before_A)] = 0.0
     if min(rise_V.max(), -rise_V[rise_V < 0.0].sum()) > MUCH_SHARE * np.ptp(voltage_V):
-        raise RecordError(
+        raise ValueError(
             f"the current has no sign: from row {rows.index[begin[np.argmax(rise_V)]] + 1} on the voltage rises, and "
-            "elsewhere it falls under a current of the same sign",
-            Advice("Leave out the charges, or name the column whose words tell them from discharges: --columns state=NAME"),
+            "elsewhere it falls under a current of the same sign. Leave out the charges, or name the column whose words tell "
+            "them from discharges: --columns state=NAME"
         )

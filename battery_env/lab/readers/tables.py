@@ -153,7 +153,7 @@ def _text_of(path: Path) -> bytes:
         content = content.decode("utf-16", errors="ignore").encode()
     kept = content.rstrip(b"\0")  # what a power cut leaves of the end
     if kind := kind_of(content) or "binary" * (10 * kept.count(b"\0") > len(kept)):
-        raise RecordError(f"the file is {kind}, and no table", Advice("Export the records as CSV, a workbook as .xlsx"))
+        raise RecordError(f"the file is {kind}, and no table", [Advice("Export the records as CSV, a workbook as .xlsx")])
     kept = kept.replace(b"\0", b"")
     if len(kept) < len(content):
         say(f"{len(content) - len(kept)} NUL bytes, which are no text, are left out")
