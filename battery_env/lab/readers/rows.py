@@ -214,7 +214,7 @@ def refuse_other_unit(true: float, ticks: float, told: str) -> None:
     for unit, (symbol, tick_s) in CLOCKS.items():
         if tick_s != 1.0 and abs(true - tick_s * ticks) <= SWITCH_SHARE * true:
             advice = Advice(f"If the time is in {unit}, state it", "units", {"time": symbol}, "time")
-            raise RecordError(f"{told}, as if the time counts {unit}: --units time={symbol}", advice)
+            raise RecordError(f"{told}, as if the time counts {unit}: --units time={symbol}", [advice])
 
 
 def with_current(rows: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> pd.DataFrame:
