@@ -21,6 +21,25 @@ from numpy.typing import NDArray
 #: What is packed may become so large, or so many times as large as it is.
 LARGEST_UNPACKED_BYTES, MOST_UNPACKED = 1 << 28, 40
 
+# Kinds of files that are no text, or none of numbers, by how they begin, in small letters.
+_KINDS = {
+    "a picture": (b"\x89png", b"\xff\xd8\xff", b"gif8", b"ii*\0", b"mm\0*", b"<svg"),
+    "a PDF": (b"%pdf",),
+    "a page of the web": (b"<!doctype html", b"<html"),
+    "a picture, a workbook or a page in XML": (b"<?xml",),
+    "a workbook, a document or an archive, of which its name says nothing": (b"pk\x03\x04", b"\x1f\x8b"),
+    "a binary workbook or document of old Office": (b"\xd0\xcf\x11\xe0",),
+    "a binary file of HDF5": (b"\x89hdf",),
+    "a database": (b"sqlite format 3",),
+    "a pointer of Git LFS, whose content git lfs pull fetches": (b"version https://git-lfs",),
+}
+
+
+def kind_of(content: bytes) -> str:
+    """What a file is, by how it begins; empty if that does not tell."""
+    head = content[:64].lstrip().lower()
+    return next((kind for kind, heads in _KINDS.items() if head.startswith(heads)), "")
+
 
 class WrongFormatError(ValueError):
     """A file holds something else than what was asked for."""

@@ -5,6 +5,7 @@ The same command goes on from the rows that are written.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import multiprocessing
@@ -29,7 +30,6 @@ import pandas as pd
 from battery_env.files import check_folder, locked, replacing
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.readers.columns import FileFormat
-from battery_env.lab.readers.discharges import Recording
 from battery_env.lab.report import METHOD_NAMES, Calibration, title_of
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import (
@@ -48,6 +48,8 @@ from battery_env.lab.sources import (
     read_source,
     record_name,
 )
+from battery_env.records.recording import Recording
+from battery_env.records.refusals import RecordError
 
 __all__ = ["FileFormat", "Outcome", "Results", "Source", "calibrate_all", "find_sources", "read_source"]
 
@@ -267,12 +269,15 @@ class Results:
         self.folder, self.with_voltages, self._settings = folder, with_voltages, settings
         self.run = folder / RUN
         self._stems = [record_name(source.stem, source.cycle) for source in sources]
-        self._stamps = {source.key: _stamp(source) for source in sources}
+        self._sources = {source.key: source for source in sources}
+        self._stamps: dict[str, list[Any] | None] = {}  # of files of which rows are there
         read = sorted({key_of(source.given) for source in sources})
         made_with = {**asdict(settings), **asdict(file_format), "sources": read, "voltages": with_voltages}
         self._header: dict[str, Any] = json.loads(_json({"format": _FORMAT, "battery_env": VERSION, **made_with}))
         self._rows: dict[tuple[str, int], dict[str, Any]] = {}
         self._counts: dict[str, int] = {}
+        #: How many lines are not as they were written.
+        self.spoiled = 0
         check_folder(folder)
 
     @contextmanager
@@ -297,19 +302,21 @@ class Results:
         """What the run in the folder was made with, and its lines; nothing if there is none."""
         if not self.run.exists():
             return {}, []
-        lines = [_line(text) for text in self.run.read_bytes().splitlines()]
-        header = lines[0] if lines else {}
+        texts = self.run.read_bytes().splitlines() if self.run.is_file() else []  # to read a pipe is to wait for it
+        header = _line(texts[0]) if texts else {}
         if header.get("format") != _FORMAT:
             raise FileExistsError(f"{self.run} is no run of battery-calibrate: choose another --out, or move it elsewhere")
-        return header, lines[1:]
+        lines = [line for line in map(_line, texts[1:]) if line.get("checksum") == _checksum(line)]
+        self.spoiled = len(texts) - 1 - len(lines)
+        return header, lines
 
     def _refuse_another(self, header: dict[str, Any], lines: list[dict[str, Any]]) -> None:
         """Refuse to begin where another run has something to lose: a discharge that could be used."""
-        if all(line["row"]["error"] for line in lines if "row" in line):
+        if not self.spoiled and all(line["row"]["error"] for line in lines):
             return
         different = {name for name in header | self._header if header.get(name) != self._header.get(name)}
         other = "battery_env" if "battery_env" in different else ", ".join(sorted(different - {"sources"}))
-        reads = f" that reads {few_of(header['sources'])}" if "sources" in header.keys() & different else ""
+        reads = f" that reads {few_of(header.get('sources', []))}" if "sources" in header.keys() & different else ""
         raise FileExistsError(
             f"{self.run} is of a command{reads}{' with another ' if other else ''}{other}; choose another --out, or give "
             "--force, which begins anew"
@@ -317,11 +324,17 @@ class Results:
 
     def _takes(self, line: dict[str, Any]) -> bool:
         """Whether a line holds: of a file that is as it was, or not there."""
-        if not line.get("whole") or self._stamps.get(line["source"]) not in (None, line["stamp"]):
+        if not line["whole"] or self._stamp_of(line["source"]) not in (None, line["stamp"]):
             return False
         self._rows[line["source"], line["number"]] = line["row"]
         self._counts[line["source"]] = line["of"]
         return True
+
+    def _stamp_of(self, key: str) -> list[Any] | None:
+        """That of a source that rows are of; ``None`` if it is not there."""
+        if key not in self._stamps:
+            self._stamps[key] = _stamp(self._sources[key]) if key in self._sources else None
+        return self._stamps[key]
 
     def _in_the_way(self, goes_on: bool) -> list[str]:
         """What has the name of a result: of a run that goes on only records, as all else is its own."""
@@ -341,26 +354,27 @@ class Results:
     @property
     def absent(self) -> int:
         """How many of these are of files that are not there."""
-        return sum(self._stamps.get(key) is None for key, _ in self._rows)
+        return sum(self._stamp_of(key) is None for key, _ in self._rows)
 
     def holds(self, source: Source, number: int | None = None) -> bool:
         """Whether a discharge of a source is done; without its number, whether all are."""
         numbers = range(self._counts.get(source.key, 0)) if number is None else (number,)
         return len(numbers) > 0 and all((source.key, each) in self._rows for each in numbers)
 
-    def keep(self, outcome: Outcome, source: Source, number: int, count: int, whole: bool = True) -> None:
+    def keep(self, outcome: Outcome, place: _Place, whole: bool = True) -> None:
         """Append a row, which is on the disk when this returns; one that is not whole is made again by the same command."""
-        key, row = source.key, outcome.row()
+        key, number, row = place.source.key, place.number, outcome.row()
         if not (outcome.error and (key, number) in self._rows):  # the file is gone since
             self._rows[key, number] = row
-        line = {"source": key, "stamp": self._stamps[key], "number": number, "of": count, "whole": whole and not outcome.error}
-        self._stream.write(f"{_json({**line, 'row': row})}\n".encode("ascii"))
+        is_whole = whole and not outcome.error
+        line = {"source": key, "stamp": place.stamp, "number": number, "of": place.of, "whole": is_whole, "row": row}
+        self._stream.write(f"{_json({**line, 'checksum': _checksum(line)})}\n".encode("ascii"))
         self._stream.flush()
         os.fsync(self._stream.fileno())
 
     def _sorted_rows(self) -> list[dict[str, Any]]:
         starts = {key: row["start_time"] for (key, number), row in self._rows.items() if number == 0 and not row["error"]}
-        order = {key: number for number, key in enumerate(_by_date(list(self._stamps), starts))}
+        order = {key: number for number, key in enumerate(_by_date(list(self._sources), starts))}
         keys = sorted(self._rows, key=lambda key: (order.get(key[0], len(order)), *key))
         return [self._rows[key] for key in keys]
 
@@ -403,14 +417,24 @@ def _draw_life(whole: pd.DataFrame, path: Path) -> None:
 
 
 def _stamp(source: Source) -> list[Any] | None:
-    """What changes with the file, or with what its results are called; ``None`` if it is not there."""
+    """What changes with the content of a file, or with what its results are called; ``None`` if it cannot be read."""
     if is_bundled(source.path):
         return [source.stem, source.cell]
+    digest = hashlib.sha256()
     try:
-        status = os.stat(source.path)
+        if not Path(source.path).is_file():  # to open a pipe is to wait for it
+            return None
+        with open(source.path, "rb") as stream:
+            while part := stream.read(1 << 20):
+                digest.update(part)
     except OSError:
         return None
-    return [source.stem, source.cell, status.st_size, status.st_mtime_ns]
+    return [source.stem, source.cell, digest.hexdigest()]
+
+
+def _checksum(line: Mapping[str, Any]) -> str:
+    """Of all that a line holds beside its checksum."""
+    return hashlib.sha256(_json({name: value for name, value in line.items() if name != "checksum"}).encode()).hexdigest()[:16]
 
 
 def _json(content: Any) -> str:
@@ -433,6 +457,7 @@ class _Place(NamedTuple):
     source: Source
     number: int
     of: int
+    stamp: list[Any] | None  # of the source before it was read
 
 
 def calibrate_all(
@@ -460,7 +485,7 @@ def calibrate_all(
     yield from done
     used = {each.record.casefold() for each in done}
     to_read = [source for source in sources if not (results and results.holds(source))]
-    reads = ((source, executor.submit(attempt, read_source, source, file_format)) for source in to_read)
+    reads = ((source, executor.submit(attempt, _read, source, file_format)) for source in to_read)
 
     def calls() -> Iterator[tuple[_Place, Future[Attempt]]]:
         starts: dict[str, str] = {}  # the latest in each folder
@@ -482,13 +507,18 @@ def calibrate_all(
     for place, made in _in_order(calls(), ahead):
         outcome, whole = (place.known, False) if place.known.error else _outcome(place.known, made, results)
         if results is not None:
-            results.keep(outcome, place.source, place.number, place.of, whole)
+            results.keep(outcome, place, whole)
         yield outcome
+
+
+def _read(source: Source, file_format: FileFormat) -> tuple[list[Any] | None, list[Recording]]:
+    """The stamp of a source, of before it is read, and its discharges."""
+    return _stamp(source), read_source(source, file_format)
 
 
 def _start_of(read: Attempt) -> str:
     """Date and time at which what was read starts; empty if it does not tell."""
-    return str(read.result[0].meta.get("start_time", "")) if read.result else ""
+    return str(read.result[1][0].meta.get("start_time", "")) if read.result else ""
 
 
 def _places(source: Source, read: Attempt, used: set[str]) -> Iterator[tuple[_Place, Recording | None]]:
@@ -497,14 +527,15 @@ def _places(source: Source, read: Attempt, used: set[str]) -> Iterator[tuple[_Pl
         error = read.error if printable(source.path) in read.error else f"{source.path}: {read.error}"
         name = _unused(record_name(source.stem, source.cycle), used)
         known = Outcome(name, source.path, source.cell, source.cycle, notes="; ".join(read.notes), error=error)
-        yield _Place(known, source, 0, 1), None
+        yield _Place(known, source, 0, 1, None), None
         return
-    for number, recording in enumerate(read.result):
+    stamp, recordings = read.result
+    for number, recording in enumerate(recordings):
         cycle = recording.meta.get("cycle")
         name = _unused(record_name(source.stem, cycle), used)
         start = str(recording.meta.get("start_time", ""))
         known = Outcome(name, source.path, source.cell, cycle, start, notes="; ".join(read.notes))
-        yield _Place(known, source, number, len(read.result)), recording
+        yield _Place(known, source, number, len(recordings), stamp), recording
 
 
 def _unused(name: str, used: set[str]) -> str:
@@ -519,7 +550,10 @@ def _unused(name: str, used: set[str]) -> str:
 
 def _calibrate(name: str, recording: Recording, settings: Settings, with_voltages: bool) -> tuple[Calibration, Attempt]:
     """What the discharge says, and its voltages as files by their suffixes."""
-    found = calibrate(recording.discharge(), settings)
+    try:
+        found = calibrate(recording.discharge(), settings)
+    except RecordError as error:
+        raise error.of(recording.origin) from error
     files = attempt(_voltages_of, name, found) if with_voltages else Attempt({}, [], "")
     return replace(found, record=None, forecast=None, end=None), files
 

@@ -37,20 +37,29 @@ from battery_env.lab.sources import Source, find_sources, read_source
 from battery_env.loads import constant
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
+from battery_env.records.refusals import Origin, RecordError
+from battery_env.records.samples import check_cut_off
 
 #: What the process returns: all records settled, one or more refused, one or more not settled, stopped, nobody reads on.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141
 
 _NAME = "battery-calibrate"
 
-_QUANTITY = re.compile(r",\s*(?=\w+=)")
+_ASSIGNMENTS = re.compile(r",\s*(?=\w+=)")
 
 
-def _assignments(text: str) -> dict[str, str]:
-    pairs = [part.partition("=") for part in _QUANTITY.split(text)]
-    if any(not (name.strip() and equals and value.strip()) for name, equals, value in pairs):
-        raise argparse.ArgumentTypeError(f"expected quantity=NAME,quantity=NAME, got {text!r}")
-    return {name.strip(): value.strip() for name, _, value in pairs}
+class _Assignments(argparse.Action):
+    """Options of the form quantity=NAME,quantity=NAME, which may be given several times, but say one thing of a quantity."""
+
+    def __call__(self, _parser: Any, namespace: argparse.Namespace, text: Any, _option: str | None = None) -> None:
+        told = dict(getattr(namespace, self.dest) or {})
+        for name, equals, value in (part.partition("=") for part in _ASSIGNMENTS.split(text)):
+            quantity, value = name.strip(), value.strip()
+            if not (quantity and equals and value):
+                raise argparse.ArgumentError(self, f"expected quantity=NAME,quantity=NAME, got {text!r}")
+            if told.setdefault(quantity, value) != value:
+                raise argparse.ArgumentError(self, f"the {quantity} cannot be both {told[quantity]!r} and {value!r}: give one")
+        setattr(namespace, self.dest, told)
 
 
 def _initial_soc(text: str) -> InitialSoc | Literal["rest"]:
@@ -202,14 +211,14 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("reading")
     group.add_argument(
         "--columns",
-        type=_assignments,
+        action=_Assignments,
         metavar="time=NAME,...",
         help="names of the columns of time, voltage, current, temperature, ambient, cycle, step, state and cell, where their "
         "names do not tell",
     )
     group.add_argument(
         "--units",
-        type=_assignments,
+        action=_Assignments,
         metavar="time=UNIT,...",
         help="their units, where the names do not tell: s, ms, min, h; V, mV; A, mA; degC, K",
     )
@@ -340,6 +349,9 @@ def _calibrate_all(
     states: Counter[str] = Counter()
     first: Outcome | None = None
     is_interrupted = False
+    if results and results.spoiled:
+        said = "lines are not as they were written, and are left out"
+        print(f"warning: {results.run}: {results.spoiled} {said}", file=sys.stderr)
     if results and (done := len(results.done)):
         absent = f", {results.absent} of them of files that are not there now" if results.absent else ""
         print(f"going on: {done} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True)
@@ -399,8 +411,17 @@ def _settings(options: argparse.Namespace) -> Settings:
         for name, value in vars(options).items()
         if name in names and value is not None
     }
-    with _saying():
+    with _saying(), _naming(options):
         return Settings.for_file(options.cell, **given)
+
+
+@contextmanager
+def _naming(options: argparse.Namespace) -> Iterator[None]:
+    """Show the command that mends an option, of the first file that the command line names."""
+    try:
+        yield
+    except RecordError as error:
+        raise error.of(Origin([*getattr(options, "records", ()), getattr(options, "record", "")][0])) from error
 
 
 def _fit(arguments: Sequence[str]) -> int:
@@ -411,6 +432,8 @@ def _fit(arguments: Sequence[str]) -> int:
     if out.suffix != ".json":
         raise ValueError(f"the fit is written as JSON: --out {out.name}.json instead of {out.name}")
     check_new(out, picture)
+    with _naming(options):
+        check_cut_off(options.cut_off)
     discharges = _discharges(options.records, _file_format(options))
     print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
     with warnings.catch_warnings(), saying_that_it_compiles():
@@ -528,6 +551,6 @@ def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Dischar
                     meta = {"cycle": number, **recording.meta, "cell": source.stem}
                     discharges.append(recording._replace(meta=meta).discharge())
             except Exception as error:  # readers of files raise what they like
-                text = " ".join(str(error).split())
+                text = str(error)
                 raise ValueError(text if source.path in text else f"{source.argument}: {text}") from error
     return discharges

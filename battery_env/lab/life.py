@@ -44,7 +44,8 @@ class Life:
     """
     What :func:`track_life` found.
 
-    The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading.
+    The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading. Where
+    their numbers leave discharges out, the walk goes on through these.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
         ``r_o_ohm``, ``settled``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off),
@@ -76,7 +77,13 @@ class Life:
         of the life, under which the error that all estimates share cancels from the end. At the ``q_mobile`` of a whole
         discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
         """
-        mean_C, sd_C = self.next_q_mobile_C
+        return self._prior_C(1)
+
+    def _prior_C(self, count: int, at_other_loads: bool = False) -> tuple[float, float]:
+        """The prior of so many discharges later, at the load of the life or at others."""
+        mean_C, sd_C = self.later_q_mobile_C(count)
+        if at_other_loads:
+            return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * self.sd_share)
         whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
         lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
         return lasted * mean_C, lasted * sd_C
@@ -84,19 +91,28 @@ class Life:
     @property
     def next_q_mobile_C(self) -> tuple[float, float]:
         """Mean and standard deviation of ``q_mobile`` in the next discharge, C."""
-        mean_C = exp(self.state.sum())
-        return mean_C, mean_C * sqrt(self.covariance.sum() + self.step_share**2)
+        return self.later_q_mobile_C(1)
+
+    def later_q_mobile_C(self, count: int) -> tuple[float, float]:
+        """Mean and standard deviation of ``q_mobile`` so many discharges after the last one, C."""
+        weights = np.array([1.0, count])
+        mean_C = exp(weights @ self.state)
+        return mean_C, mean_C * sqrt(weights @ self.covariance @ weights + count * self.step_share**2)
 
     @property
     def prior_at_other_loads_C(self) -> tuple[float, float]:
         """The same for a load that is not that of the life: the error that all estimates share counts too, in full."""
-        mean_C, sd_C = self.next_q_mobile_C
-        return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * self.sd_share)
+        return self._prior_C(1, at_other_loads=True)
+
+    def discharges_until(self, cycle: int | None) -> int:
+        """How many discharges after the last one of the life that of a number is; 1 where the numbers do not tell."""
+        return int(_passed(pd.Series([self.table["cycle"].iloc[-1], cycle]))[-1])
 
     def prior_for(self, running: Discharge, load: LoadToCome | None = None) -> tuple[float, float]:
         """
         The prior that suits a discharge in progress: :attr:`prior_q_mobile_C` where all currents, so far and to come, lie
-        within 5 % of those of the life, and :attr:`prior_at_other_loads_C` anywhere else.
+        within 5 % of those of the life, and :attr:`prior_at_other_loads_C` anywhere else. Where its number says that it is not
+        the next one after the life, it is as unsure as the fade in between.
 
         :param running: the discharge in progress
         :param load: to come, as :func:`battery_env.forecast` takes it; ``None``: as so far
@@ -107,12 +123,12 @@ class Life:
         elif load is None or isinstance(load, Real):
             to_come_A = [] if load is None else [float(load)]
         else:
-            return self.prior_at_other_loads_C
+            return self._prior_C(self.discharges_until(running.meta.get("cycle")), at_other_loads=True)
         usual_A = self.table["mean_current_A"][self.table["valid"]].iloc[-1]
         so_far_A = np.quantile(running.current_A[running.time_s > running.load_on_time_s], [0.05, 0.95])
         currents_A = [usual_A, *so_far_A, *to_come_A]
         is_usual = np.ptp(currents_A) <= VARIED_SHARE * max(currents_A)
-        return self.prior_q_mobile_C if is_usual else self.prior_at_other_loads_C
+        return self._prior_C(self.discharges_until(running.meta.get("cycle")), at_other_loads=not is_usual)
 
     def after(self, count: int) -> Life:
         """
@@ -130,7 +146,8 @@ class Life:
         """
         The remaining useful life: how many discharges are still to come, the one included that first has less capacity than
         the threshold. The cell is used as before; its capacity is in proportion to ``q_mobile``, as in the last discharge, and
-        does not grow in the long run. A row of the table counts as one discharge: check-ups make the answer too long.
+        does not grow in the long run. Discharges are counted by their numbers; without these a row counts as one, so that
+        check-ups make the answer too long.
 
         :param threshold_Ah: capacity at which the life ends, Ah
         :param probability: of the quantiles, within 0 .. 1, any shape
@@ -260,7 +277,7 @@ def life_of(table: pd.DataFrame) -> Life:
     valid = table["valid"].to_numpy(dtype=np.bool_)
     if not valid.any():
         raise ValueError(f"no discharge determines q_mobile. {_most_common(table['reason'])}")
-    readings = np.log(table["q_mobile_C"].to_numpy())
+    readings, passed = np.log(table["q_mobile_C"].to_numpy()), _passed(table["cycle"])
     first = int(np.flatnonzero(valid)[0])
     centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
     expected = np.full((len(readings), 2), np.nan)
@@ -268,7 +285,7 @@ def life_of(table: pd.DataFrame) -> Life:
 
     def surprise(logarithms: FloatArray) -> float:
         step, noise = np.exp(np.clip(logarithms, -15.0, 0.0))
-        out = _filtered(readings, valid, first, step, noise, PRIOR_DRIFT_SD_SHARE, expected, state, covariance)
+        out = _filtered(readings, passed, valid, first, step, noise, PRIOR_DRIFT_SD_SHARE, expected, state, covariance)
         return float(out + 0.5 * ((logarithms - centre) ** 2).sum())
 
     best = minimize(surprise, centre, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4}).x
@@ -277,6 +294,12 @@ def life_of(table: pd.DataFrame) -> Life:
     mean_C = np.exp(expected[:, 0])
     table = table.assign(expected_q_mobile_C=mean_C, expected_sd_C=mean_C * np.sqrt(expected[:, 1]))
     return Life(table, float(step), float(noise), float(state[1]), state, covariance)
+
+
+def _passed(numbers: pd.Series) -> FloatArray:
+    """How many discharges each is after the one before, by their numbers; 1 where these do not increase."""
+    passed = pd.to_numeric(numbers, errors="coerce").diff().to_numpy(dtype=np.float64)
+    return np.where(passed > 1.0, passed, 1.0)
 
 
 def _most_common(reasons: pd.Series) -> str:
@@ -289,6 +312,7 @@ def _most_common(reasons: pd.Series) -> str:
 @compiled
 def _filtered(
     readings: FloatArray,
+    passed: FloatArray,
     valid: BoolArray,
     first: int,
     step: float,
@@ -304,9 +328,9 @@ def _filtered(
     p_level, p_both, p_drift = noise**2, 0.0, drift_sd**2
     surprise = 0.0
     for n in range(first + 1, len(readings)):
-        level += drift
-        p_level += 2.0 * p_both + p_drift + step**2
-        p_both += p_drift
+        level += passed[n] * drift
+        p_level += 2.0 * passed[n] * p_both + passed[n] ** 2 * p_drift + passed[n] * step**2
+        p_both += passed[n] * p_drift
         expected[n, 0], expected[n, 1] = level, p_level
         if valid[n]:
             variance, innovation = p_level + noise**2, readings[n] - level

@@ -16,7 +16,6 @@ from battery_env.lab.batch import attempt
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.life import Life, life_before
 from battery_env.lab.readers.columns import FileFormat, recognise
-from battery_env.lab.readers.discharges import Recording
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.report import Calibration
 from battery_env.lab.running import forecast_end
@@ -24,6 +23,7 @@ from battery_env.lab.settings import Settings
 from battery_env.lab.sources import Source, find_sources, no_formula, read_source, record_name
 from battery_env.loads import constant
 from battery_env.records.discharge import Discharge
+from battery_env.records.recording import Recording
 
 LAYOUT = {"height": 330, "margin": {"t": 30, "b": 30}, "legend": {"orientation": "h", "y": -0.25}, "showlegend": True}
 # The columns that are read most, by label.

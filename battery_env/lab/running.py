@@ -49,6 +49,11 @@ class End:
         return self.calibration.end
 
     @property
+    def discharges_after_life(self) -> int:
+        """How many discharges after the last one of the life it is, by their numbers."""
+        return 1 if self.life is None else self.life.discharges_until(self.calibration.cycle)
+
+    @property
     def contradicted(self) -> bool:
         """Whether something in the record contradicts the estimate; one that is only imprecise has a wide interval."""
         return not self.calibration.settled and not is_only_imprecise(self.calibration.reason)
@@ -77,6 +82,7 @@ class End:
             **{name: [finite_or_none(value) for value in quantile(values, BAND).tolist()] for name, values in samples.items()},
             "nominal_Ah": finite_or_none(found.nominal_Ah),
             "life_discharges": 0 if self.life is None else int(self.life.table["valid"].sum()),
+            "discharges_after_life": self.discharges_after_life,
             "prior_q_mobile_C": None if prior_C is None else list(prior_C),
             "notes": list(found.notes),
         }
@@ -88,7 +94,9 @@ class End:
             valid = self.life.table["valid"]
             left_out = f"; {(~valid).sum()} left out" if not valid.all() else ""
             plural = "" if valid.sum() == 1 else "s"
-            lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}")
+            later = self.discharges_after_life
+            sparse = f"; the last one is {later} before this one, and the fade in between is not known" if later > 1 else ""
+            lines.append(f"life of {valid.sum()} earlier discharge{plural}{left_out}{sparse}")
         if (prior_C := self.calibration.settings.prior_q_mobile_C) is not None:
             mean_Ah, sd_Ah = (each_C / 3600.0 for each_C in prior_C)
             digits = decimals(mean_Ah, 3)

@@ -22,6 +22,7 @@ from battery_env.estimators.reasons import Reason
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import CUT_OFF_V, DischargeStart
+from battery_env.records.samples import check_cut_off
 
 Method = Literal["least-squares", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -109,8 +110,7 @@ class Settings:
             raise ValueError(f"a path of aging cells is for least squares, got the method {self.method!r}")
         if self.method == "policy":
             self._refuse_for_the_policy()
-        if not 0.0 < self.resolved.cut_off_V < np.inf:
-            raise ValueError(f"the cut-off must be a voltage above 0 V, got {self.cut_off_V!r}")
+        check_cut_off(self.resolved.cut_off_V)
 
     def _refuse_for_the_policy(self) -> None:
         """Refuse what a policy cannot be told: it has learned on one model, a new 18650."""

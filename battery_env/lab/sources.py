@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from battery_env.lab.readers.columns import FileFormat
-from battery_env.lab.readers.discharges import Recording, read_recordings
+from battery_env.lab.readers.discharges import read_recordings
 from battery_env.lab.readers.tables import BINARY_SUFFIXES, NUMBERED_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
 from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
+from battery_env.records.recording import Recording
+from battery_env.records.refusals import Origin
 
 #: Results that an earlier command wrote among the records: rows, the table of them, voltages, a figure.
 RUN, TABLE, VOLTAGE, LIFE = "estimate.jsonl", "estimate.csv", "_voltage", "life.png"
@@ -184,7 +186,8 @@ def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
     if is_bundled(path):
         columns = ("time_s", "voltage_V", "current_A", "temperature_C")
         recordings = [
-            Recording({name: getattr(each, name) for name in columns}, each.meta) for each in load_nasa_discharges(path)
+            Recording({name: getattr(each, name) for name in columns}, each.meta, Origin(path, frozenset()))
+            for each in load_nasa_discharges(path)
         ]
     elif Path(path).is_dir():
         os.scandir(path).close()  # which says why, where it cannot be looked into

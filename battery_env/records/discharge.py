@@ -27,6 +27,7 @@ from battery_env.records.load import (
     switch_times_s,
     switched_sd_C,
 )
+from battery_env.records.refusals import Advice, RecordError
 from battery_env.records.samples import MILLIAMPERE, check_column, check_drawn_charge, check_samples, drawn_charge_C
 
 #: How to cite the bundled data.
@@ -105,21 +106,23 @@ class Discharge:
         duration_s = self.time_s[-1] - self.time_s[0]
         least_s, most_s = _DURATION_LIMITS_S
         if not least_s <= duration_s <= most_s:
-            spans = [
-                f"{factor * duration_s:.0f} s if it is in {unit} (command line: --units time={symbol})"
-                for unit, (symbol, factor) in CLOCKS.items()
-                if least_s <= factor * duration_s <= most_s
+            units = [
+                Advice(
+                    f"Give the time in seconds: {tick_s * duration_s:.0f} s if it is in {unit}", "units", {"time": it}, "time"
+                )
+                for unit, (it, tick_s) in CLOCKS.items()
+                if least_s <= tick_s * duration_s <= most_s
             ]
-            advice = f" Give the time in seconds: {', '.join(spans)}." if spans else ""
-            raise ValueError(
+            raise RecordError(
                 f"time_s must span {least_s:g} .. {most_s:g} s, got {duration_s:g} s, too "
-                f"{'short' if duration_s < least_s else 'long'} for a discharge.{advice}"
+                f"{'short' if duration_s < least_s else 'long'} for a discharge",
+                units,
             )
         check_drawn_charge(drawn_charge_C(self))
         if self.charge_C > Q_MOBILE.limits[1]:
-            raise ValueError(
-                f"this record draws {self.charge_C:.3g} C, more than the {Q_MOBILE.limits[1]:g} C that a cell may hold. "
-                f"{MILLIAMPERE}"
+            raise RecordError(
+                f"this record draws {self.charge_C:.3g} C, more than the {Q_MOBILE.limits[1]:g} C that a cell may hold",
+                [MILLIAMPERE],
             )
 
     def _derived(self, **changes: Any) -> Discharge:
@@ -266,9 +269,10 @@ class Discharge:
             under_load_V = self.voltage_V[first : last + 1]
             if (above := int((under_load_V > cut_off_V).sum())) + LEAST_SAMPLES <= len(under_load_V):
                 rest = f", but for {above} samples," if above else ""
-                raise ValueError(
-                    f"all of the voltage under load{rest} lies below the cut-off of {cut_off_V:g} V: state where it ends, "
-                    f"--cut-off {under_load_V[under_load_V > 0.0].min(initial=cut_off_V):.4g} (Python: cut_off_V)"
+                least_V = float(f"{under_load_V[under_load_V > 0.0].min(initial=cut_off_V):.4g}")
+                raise RecordError(
+                    f"all of the voltage under load{rest} lies below the cut-off of {cut_off_V:g} V",
+                    [Advice("State where the discharge ends", "cut_off_V", least_V)],
                 )
             raise ValueError(
                 f"only {len(time_s)} samples lie between load-on at {start_s:g} s and {cut_off_V:g} V or the end of the load; "

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_LIMITS, check_real
 from battery_env.records.load import REST_CURRENT_A, drawn
+from battery_env.records.refusals import Advice, RecordError
 
 #: Least and greatest time between two samples of a stream, s. Seconds given in milliseconds or in hours are mostly beyond.
 SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
@@ -19,21 +20,35 @@ REST_LIMIT_S = 604_800.0
 #: Where discharges of recorded cells end if nothing else is said, V.
 CUT_OFF_V = 2.7
 
-_MILLIVOLT = "Give the voltage of one cell in V, not in mV (command line: --units voltage=mV), and not that of a pack."
 #: What a current that is out of range usually is.
-MILLIAMPERE = "Give the current in A, not in mA (command line: --units current=mA), and that of one cell."
+MILLIAMPERE = Advice("Give the current in A, not in mA", "units", {"current": "mA"}, "current")
 # What to do about a value that is missing in a stream
 _MISSING = {
     "voltage_V": "A voltage may be missing (NaN), but for the first one, which tells whether the cell is full.",
     "current_A": "The charge that was drawn cannot do without it: give the mean current since it was last known.",
     "temperature_C": "Leave it out (None) where it is missing.",
 }
-_KELVIN = "Give the temperature in degrees Celsius, not in kelvin (command line: --units temperature=K)."
-#: By name: least and largest plausible value, unit, what a value beyond usually is.
-PLAUSIBLE: dict[str, tuple[float, float, str, str]] = {
-    "voltage_V": (-0.1, 5.5, "V", _MILLIVOLT),  # half cells are driven a little below 0
-    "current_A": (-LOAD_LIMITS["current"], LOAD_LIMITS["current"], "A", MILLIAMPERE),
-    "temperature_C": (-60.0, 150.0, "degC", _KELVIN),
+#: What the sign of a current may be, where it was taken for the other one.
+SIGNS = (
+    Advice("State that the file counts a discharge as negative", "discharge_is_negative", True, "is negative"),
+    Advice("State that the file counts a discharge as positive", "discharge_is_negative", False, "is positive"),
+)
+#: By name: least and largest plausible value, and unit.
+PLAUSIBLE: dict[str, tuple[float, float, str]] = {
+    "voltage_V": (-0.1, 5.5, "V"),  # half cells are driven a little below 0
+    "current_A": (-LOAD_LIMITS["current"], LOAD_LIMITS["current"], "A"),
+    "temperature_C": (-60.0, 150.0, "degC"),
+}
+# What a value beyond usually is.
+_BEYOND = {
+    "voltage_V": (
+        Advice("Give the voltage of one cell, not that of a pack"),
+        Advice("Give the voltage in V, not in mV", "units", {"voltage": "mV"}, "voltage"),
+    ),
+    "current_A": (MILLIAMPERE,),
+    "temperature_C": (
+        Advice("Give the temperature in degrees Celsius, not in kelvin", "units", {"temperature": "K"}, "temperature"),
+    ),
 }
 
 
@@ -89,19 +104,19 @@ def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray
     if len(bad):
         raise ValueError(f"{name} must be finite, got {array[bad[0]]} at sample {bad[0]}. Remove or fill such samples.")
     if name in PLAUSIBLE:
-        low, high, _, _ = PLAUSIBLE[name]
+        low, high, _ = PLAUSIBLE[name]
         bad = np.flatnonzero((array < low) | (array > high))
         if len(bad):
-            raise ValueError(_implausible(name, float(array[bad[0]]), f" at sample {bad[0]}"))
+            raise _implausible(name, float(array[bad[0]]), f" at sample {bad[0]}")
     array.setflags(write=False)
     return array
 
 
-def _implausible(name: str, value: float, where: str = "") -> str:
-    low, high, unit, hint = PLAUSIBLE[name]
+def _implausible(name: str, value: float, where: str = "") -> RecordError:
+    low, high, unit = PLAUSIBLE[name]
     # what is too low is of no other unit, as a negative voltage of a half cell
-    advice = f" {hint}" if value > high or low == -high else ""
-    return f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}.{advice}"
+    advice = _BEYOND[name] if value > high or low == -high else ()
+    return RecordError(f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}", advice)
 
 
 def check_record(record: Record, least_samples: int = 1) -> Samples:
@@ -135,9 +150,9 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
                 "Sort the samples, and give one discharge at a time, or number them in a column of the cycle. A clock that "
                 "starts anew, at midnight or with each step, needs dates"
             )
-        raise ValueError(
-            f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s. "
-            f"{advice}."
+        raise RecordError(
+            f"time_s must increase from sample to sample, but sample {n} is at {time[n]:g} s, after {time[n - 1]:g} s",
+            [Advice(advice)],
         )
     return Samples(**arrays)
 
@@ -157,11 +172,11 @@ def check_sample(
     if temperature_C is not None:
         measured["temperature_C"] = temperature_C
     for name, value in measured.items():
-        low, high, _, _ = PLAUSIBLE[name]
+        low, high, _ = PLAUSIBLE[name]
         if _is_within(name, value, low, high) or (name == "voltage_V" and previous_A is not None and isnan(value)):
             continue
         if isfinite(value):
-            raise ValueError(_implausible(name, value))
+            raise _implausible(name, value)
         raise ValueError(f"{name} must be finite, got {value!r}. {_MISSING[name]}")
     if previous_A is None:
         return
@@ -187,10 +202,22 @@ def _is_within(name: str, value: float, low: float, high: float) -> bool:
 def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
     """Refuse a current of the wrong sign."""
     if not charge_C > least_C:
-        raise ValueError(
-            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total: flip the sign of the "
-            "current (discharge_is_negative; command line: --discharge-is-negative or --discharge-is-positive)."
+        raise RecordError(
+            f"current_A is positive in discharge, but this record draws {charge_C:.6g} C in total: flip the sign of it",
+            SIGNS,
         )
+
+
+def check_cut_off(cut_off_V: float) -> float:
+    """Refuse what is no voltage of one cell."""
+    most_V = PLAUSIBLE["voltage_V"][1]
+    if not 0.0 < cut_off_V <= most_V:
+        is_in_mV = 0.0 < 1e-3 * cut_off_V <= most_V
+        advice = [Advice("Give the cut-off in V, not in mV", "cut_off_V", 1e-3 * cut_off_V)] if is_in_mV else []
+        raise RecordError(
+            f"the cut-off must be a voltage of one cell, above 0 and up to {most_V:g} V, got {cut_off_V:g}", advice
+        )
+    return cut_off_V
 
 
 def drawn_charge_C(record: Record) -> float:

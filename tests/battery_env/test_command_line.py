@@ -1,3 +1,4 @@
+import shlex
 import shutil
 import subprocess
 import sys
@@ -229,6 +230,43 @@ def test_bad_input_is_one_line_and_no_traceback(arguments, message, lab, recorde
     assert message in terminal.refuses(*arguments)
 
 
+@pytest.mark.parametrize("command_name", ["calibrate", "forecast", "fit"])
+def test_a_cut_off_in_mV_is_called_that(command_name, recorded, tmp_path, terminal):
+    out = ["--out", tmp_path / "cell.json"] if command_name == "fit" else []
+    names = [] if command_name == "calibrate" else [command_name]
+    refused = terminal.refuses(*names, "B0005:1", "--cut-off", "2700", *out)
+    assert "a voltage of one cell, above 0 and up to 5.5 V, got 2700. Give the cut-off in V, not in mV:" in refused
+    assert refused.endswith("battery-calibrate B0005:1 --cut-off 2.7")
+
+
+def test_options_of_quantities_that_are_given_twice_are_merged_or_refused(recorded, tmp_path, terminal, capsys):
+    path = tmp_path / "cell.csv"
+    table = pd.DataFrame({"t": recorded.time_s / 60.0, "U": 1e3 * recorded.voltage_V, "I": recorded.current_A})
+    table.to_csv(path, index=False)
+    merged = terminal.shows(path, "--units", "time=min", "--units", "voltage=mV", "--units", "time=min")
+    assert merged == terminal.shows(path, "--units", "time=min,voltage=mV")
+    for units in (["time=min,time=s"], ["time=min", "--units", "time=s"]):
+        with pytest.raises(SystemExit, match="2"):
+            command([str(path), "--units", *units])
+        assert "the time cannot be both 'min' and 's': give one" in capsys.readouterr().err
+
+
+def test_a_command_that_is_shown_keeps_what_was_stated_and_its_table_is_that_of_columns(
+    recorded, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    table = pd.DataFrame({"Zeit, ab": recorded.time_s, "it's U": recorded.voltage_V, "load": 1e3 * recorded.current_A})
+    table.to_csv("a cell.csv", index=False)
+    assert command(["a cell.csv", "--units", "current=mA"]) == 2
+    problem, *lines, asked, shown = capsys.readouterr().err.splitlines()
+    assert problem == "error: a cell.csv: no column for the time, the voltage, the current."
+    assert asked == "Name the columns, or their places:"
+    assert command(["columns", "a cell.csv", "--out", "tester.toml"]) == 3
+    assert capsys.readouterr().out.splitlines()[: len(lines)] == lines
+    name, *arguments = shlex.split(shown)
+    assert name == "battery-calibrate" and command(arguments) == 0
+
+
 def test_the_version_is_that_of_the_package(capsys):
     with pytest.raises(SystemExit, match="0"):
         command(["--version"])
@@ -391,7 +429,7 @@ class TestInPython:
             assert str(found).splitlines()[1:] == terminal.shows(source).splitlines()[1:]
         shutil.copy(lab / "life.csv", tmp_path / "life.csv")
         (tmp_path / "damaged.csv").write_text("no record")
-        with pytest.warns(UserWarning, match="damaged.csv.* It is left out"):
+        with pytest.warns(UserWarning, match="It is left out: .*damaged.csv"):
             assert [each.cycle for each in battery_env.calibrate(tmp_path)] == [1, 2, 3]
         with pytest.raises(FileNotFoundError, match="no file 'B0099:1'; the bundled cells are given as"):
             battery_env.calibrate("B0099:1")

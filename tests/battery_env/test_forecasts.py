@@ -380,6 +380,16 @@ class TestCommand:
         assert [life.prior_for(running, load) for load in loads] == list(loads.values())
         assert life.prior_for(running, read_load("profile.csv")) == life.prior_for(running, lambda time_s: 2.0) == other
 
+    def test_a_sparse_life_is_as_unsure_as_the_fade_and_says_so(self, terminal):
+        running = load_nasa_discharges("B0006")[79]
+        write(running.until(1300.0), "sparse.csv")
+        pd.read_csv("sparse.csv").assign(cycle=80).to_csv("sparse.csv", index=False)
+        row = terminal.row("forecast", "sparse.csv", "--life", "B0006:1", "B0006:40")
+        low_s, _, high_s = row["eod_time_s"]
+        assert low_s < running.eod_time_s(2.7) < high_s and row["discharges_after_life"] == 40
+        said = terminal.shows("forecast", "sparse.csv", "--life", "B0006:1", "B0006:40")
+        assert "life of 2 earlier discharges; the last one is 40 before this one" in said
+
     def test_of_its_own_folder_only_what_came_before_counts(self, terminal):
         table = pd.read_csv("all.csv")
         Path("folder").mkdir()

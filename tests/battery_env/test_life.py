@@ -50,6 +50,23 @@ class TestSeries:
                 inside.append(low <= end + 1 - 20 <= high)
         assert np.mean(inside) >= 0.8
 
+    @pytest.mark.parametrize("numbers", [(1, 40), (1, 20, 40), (1, 2, 3)])
+    def test_the_last_number_far_ahead_lies_inside_as_often_as_said(self, numbers):
+        inside = []
+        for seed in range(40):
+            q_C = walk(seed, 90)
+            life = followed(q_C[np.array(numbers) - 1], cycle=numbers)
+            mean_C, sd_C = life.later_q_mobile_C(80 - numbers[-1])
+            inside.append(abs(q_C[79] - mean_C) <= 1.645 * sd_C)
+            assert sd_C > 3.0 * life.next_q_mobile_C[1] > 0.0
+        assert 0.8 <= np.mean(inside)
+
+    def test_numbers_that_do_not_go_on_count_as_the_next(self):
+        q_C = walk(0, 6)
+        plain, anew = followed(q_C), followed(q_C, cycle=[7, 8, 9, 1, 2, 3])
+        assert plain.prior_q_mobile_C == anew.prior_q_mobile_C == followed(q_C, cycle=["a"] * 6).prior_q_mobile_C
+        assert [plain.discharges_until(cycle) for cycle in (None, 3, 7, 46)] == [1, 1, 1, 40]
+
     def test_estimates_that_are_not_valid_are_left_aside(self):
         q_C, valid = walk(0, 30), np.arange(30) != 17
         lives = [followed(np.where(valid, q_C, wrong), valid=valid) for wrong in (1000.0, 20_000.0, np.nan)]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -311,6 +312,52 @@ def test_a_file_that_has_changed_is_read_again(pair, capsys):
     again = pd.read_csv("out/estimate.csv")
     assert list(again["record"]) == ["c0", "c1"] and again["q_mobile_C"][0] == before["q_mobile_C"][0]
     assert again["q_mobile_C"][1] < before["q_mobile_C"][1] - 500.0
+
+
+def test_a_record_that_changed_under_its_old_size_and_time_is_read_again(quick, pair, capsys):
+    arguments = "lab --out out --table-only".split()
+    assert command(arguments) == 0
+    path = Path("lab/c1.csv")
+    before, text = path.stat(), path.read_text()
+    path.write_text(text[:-2] + str((int(text[-2]) + 1) % 10) + text[-1])
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert (path.stat().st_size, path.stat().st_mtime_ns) == (before.st_size, before.st_mtime_ns)
+    assert command(arguments) == 0
+    assert "going on: 1 discharges are done" in capsys.readouterr().err
+    os.utime(path)  # what it holds is as it was
+    assert command(arguments) == 0
+    assert "going on: 2 discharges are done" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda line: re.sub(rb'("q_mobile_C": \d)', rb"\g<1>1", line),
+        lambda line: line.replace(b'"number": 0, ', b""),
+        lambda line: line.replace(b'"whole": true', b'"whole": 1'),
+        lambda line: line[: line.index(b', "row"')] + b"}",
+    ],
+    ids=["a digit", "no number", "no truth value", "no row"],
+)
+def test_a_line_that_was_changed_by_hand_is_made_again_and_said(change, quick, pair, capsys, terminal):
+    arguments = "lab --out out --table-only".split()
+    assert command(arguments) == 0
+    whole, run = Path("out/estimate.csv").read_bytes(), Path("out/estimate.jsonl")
+    header, first, second = run.read_bytes().splitlines()
+    changed = change(first)
+    assert changed != first
+    run.write_bytes(b"\n".join([header, changed, second, b""]))
+    assert "is of a command with another nominal_Ah" in terminal.refuses(*arguments, "--nominal", "2")
+    assert command(arguments) == 0
+    said = capsys.readouterr().err
+    assert "estimate.jsonl: 1 lines are not as they were written, and are left out" in said
+    assert "going on: 1 discharges are done" in said and Path("out/estimate.csv").read_bytes() == whole
+
+
+def test_a_pipe_in_the_place_of_a_run_is_a_sentence(quick, pair, terminal):
+    Path("out").mkdir()
+    os.mkfifo("out/estimate.jsonl")
+    assert "estimate.jsonl is no run of battery-calibrate: choose another --out" in terminal.refuses("lab", "--out", "out")
 
 
 def test_no_text_of_a_table_is_a_formula(quick, pair):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from unicodedata import normalize
 
 from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.lab.readers.testers import INSTEAD, LONGEST, QUANTITIES, REQUIRED, TESTERS, Tester, joined, words_of
+from battery_env.records.refusals import Advice, RecordError
 
 # Quantities that only a name with a unit is: p and q may be anything.
 _WITH_UNIT = ("counter", "power", "charge_step", "capacity")
@@ -99,7 +99,6 @@ class Recognised(NamedTuple):
     missing: list[str]  # quantities that a record must have
     names: Sequence[str]  # all of the table
     rows: Sequence[Sequence[str]]  # fields of its first rows
-    source: str
 
     def lines(self) -> list[str]:
         """What the table begins with, and what is known of it."""
@@ -108,35 +107,32 @@ class Recognised(NamedTuple):
         told |= {"tester": self.tester.name}
         told |= {key: f"{each.name!r}{f' in {each.unit}' if each.unit else ''}" for key, each in self.columns.items()}
         told |= {each: "not found" for each in self.missing} | {"not used": ", ".join(self._unused())}
-        return [f"{key:<12}{text if len(text) <= LONGEST else f'{text[:LONGEST]} ...'}" for key, text in told.items()]
+        return [f"{key:<12}{text[:LONGEST]}{' ...' * (len(text) > LONGEST)}".rstrip() for key, text in told.items()]
 
     def _unused(self) -> list[str]:
         used = {column.position for column in self.columns.values()}
         return [name for n, name in enumerate(self.names) if name and n not in used]
 
+    @property
+    def open_questions(self) -> frozenset[str]:
+        """What may be stated: units that nothing tells, and the sign."""
+        return frozenset(each for each, column in self.columns.items() if not column.unit) | {"is positive", "is negative"}
+
     def check(self) -> Recognised:
-        """Refuse a table of which a quantity is missing."""
-        if self.missing:
-            raise self.refusal(f"no column for the {', the '.join(self.missing)}")
-        return self
-
-    def refusal(self, reason: object) -> ValueError:
-        """Why the table is not read, with its first lines, what is known of it, and what reads it."""
-        likely = {each: [name for name in self._unused() if _unit_in(name, each)] for each in self.missing}
-        columns = [f"{each}={names[0] if len(names) == 1 else 'NAME'}" for each, names in likely.items()]
-        if self.names[:1] == ["1"]:
-            columns = [f"{each}={place}" for place, each in enumerate(self.missing, start=1)]
-        told = "; ".join(" ".join(line.split()) for line in self.lines())
-        command = ["battery-calibrate", self.source, "--columns", ",".join(columns) or "time=NAME"]
-        return ValueError(
-            f"{str(reason).rstrip('.')}. {told}. Where this is wrong name columns, or their places (Python: columns), or fill "
-            f"in the file that {shlex.join(['battery-calibrate', 'columns', self.source])} writes:\n  {shlex.join(command)}"
-        )
+        """Refuse a table of which quantities are missing, and name what may be them: columns with such a unit, or else any."""
+        if not self.missing:
+            return self
+        unused = self._unused()
+        fitting = {each: [name for name in unused if _unit_in(name, each)] for each in self.missing}
+        others = iter([name for name in unused if not any(name in names for names in fitting.values())])
+        named = {each: names or [next(others, "NAME")] for each, names in fitting.items()}
+        choices = range(max(map(len, named.values())))
+        likely = [{each: names[min(n, len(names) - 1)] for each, names in named.items()} for n in choices]
+        advice = [Advice("Name the columns, or their places", "columns", each) for each in likely]
+        raise RecordError(f"no column for the {', the '.join(self.missing)}", advice)
 
 
-def recognise(
-    names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]], source: str = "FILE"
-) -> Recognised:
+def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]]) -> Recognised:
     """
     Which tester's table it is, the first of which it has a mark, and its columns. A unit is told from the name, as in
     ``Current(mA)``, ``Voltage / V``, ``mAmps`` or ``test_time_second``, or from the line below it; one of another quantity
@@ -169,7 +165,7 @@ def recognise(
                 found[key] = Column(place, names[place], unit, float(scale or 1.0) * factor, offset)
     given = {"current"} if file_format.load else set[str]()
     missing = [each for each in REQUIRED if not {each, *INSTEAD.get(each, ())} & (set(found) | given)]
-    return Recognised(tester, found, missing, names, rows, source)
+    return Recognised(tester, found, missing, names, rows)
 
 
 def _places_of(columns: Mapping[str, str], units: Mapping[str, str], names: Sequence[str]) -> dict[str, int]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 import warnings
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -16,12 +16,12 @@ import pandas as pd
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_LIMITS
-from battery_env.lab.readers.columns import FileFormat, Recognised, recognise, say
+from battery_env.lab.readers.columns import FileFormat, recognise, say
 from battery_env.lab.readers.nasa import read_nasa_mat
 from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, changes, refuse_other_unit, rows_of
 from battery_env.lab.readers.signs import MUCH_SHARE, with_signed_current
 from battery_env.lab.readers.tables import check_mat, open_file, open_frame
-from battery_env.lab.readers.testers import Tester, find_tester
+from battery_env.lab.readers.testers import REQUIRED, Tester, find_tester
 from battery_env.records import (
     LEAST_LOAD_SHARE,
     LOAD_SHARE,
@@ -33,6 +33,9 @@ from battery_env.records import (
     is_load,
 )
 from battery_env.records.discharge import LEAST_SAMPLES, Discharge
+from battery_env.records.recording import Recording
+from battery_env.records.refusals import TABLE, Origin, RecordError
+from battery_env.records.samples import SIGNS
 
 Made = TypeVar("Made")
 
@@ -42,26 +45,6 @@ _RETURNED_SHARE = 0.2
 # within the load ends the discharge only if it returns more than this share of the largest charge drawn: early pulses return
 # much of the little drawn yet.
 _CHARGED_SHARE = 0.02
-
-
-class Recording(NamedTuple):
-    """What a file or a table holds of one discharge, not checked yet."""
-
-    arrays: dict[str, Any]  # arguments of Discharge, by name
-    meta: dict[str, Any]  # what else is known; without ``cycle`` if the file holds one discharge and does not number it
-    # advice, by a part of it, that cannot help: to state a unit that is known, or a sign that was told from the data
-    vain: frozenset[str] = frozenset()
-
-    def discharge(self) -> Discharge:
-        """Check it; sentences of an error that advise in vain are left out."""
-        if (count := len(self.arrays["time_s"])) < LEAST_SAMPLES:
-            raise ValueError(f"{count} rows are no discharge. If each is the end of a step, export all that was recorded.")
-        try:
-            return Discharge(**self.arrays, meta=self.meta)
-        except ValueError as error:
-            first, *more = re.split(r"(?<=[^.]\.) (?=[A-Z])", str(error))
-            kept = [each for each in more if not any(part in each for part in self.vain)]
-            raise ValueError(" ".join([first, *kept])) from error
 
 
 def read_discharges(
@@ -127,7 +110,7 @@ def each_usable(use: Callable[[Discharge], Made], readers: Mapping[str, Callable
         if not made:
             raise errors[0]
         for reason in errors:
-            warnings.warn(f"{reason} It is left out.", stacklevel=3)
+            warnings.warn(f"It is left out: {reason}", stacklevel=3)
     finally:
         errors.clear()  # an error holds the frame that holds it, and with it what its reader had opened
     return made
@@ -151,37 +134,34 @@ def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) ->
 def read_recordings(source: str | Path | pd.DataFrame, file_format: FileFormat) -> list[Recording]:
     """The discharges of a file or a table, one at least, before they are checked: one that cannot be used loses no other."""
     name = _name_of(source)
+    told = Origin(name)
+    lines: list[str] = []
     try:
         if not isinstance(source, pd.DataFrame) and Path(source).suffix.lower() == ".mat":
             check_mat(Path(source))
-            recordings = [Recording(arrays, meta) for arrays, meta in read_nasa_mat(Path(source))]
+            told = Origin(name, frozenset())
+            recordings = [Recording(arrays, meta, told) for arrays, meta in read_nasa_mat(Path(source))]
         else:
             opened = open_frame(source) if isinstance(source, pd.DataFrame) else open_file(Path(source), file_format)
-            known = recognise(opened.names, file_format, opened.rows, name).check()
-            recordings = _recordings(name, opened.read(known), known, file_format)
+            known = recognise(opened.names, file_format, opened.rows)
+            lines, told = known.lines(), Origin(name, known.open_questions, vars(file_format))
+            rows = rows_of(opened.read(known.check()), known, file_format)
+            if not file_format.load:  # which is what it says
+                before_A, rows = rows["current"], with_signed_current(rows, known, file_format.discharge_is_negative)
+                taken = "is negative" if (before_A * rows["current"]).sum() < 0.0 else "is positive"
+                told = replace(told, open_questions=known.open_questions - {taken})
+            recordings = _split(rows, told)
         if not recordings:
             raise ValueError("there is no discharge")
     except (TypeError, ValueError) as error:
-        raise ValueError(str(error) if str(error).startswith(name) else f"{name}: {error}") from error
+        raise ValueError(f"{name}: {RecordError.like(error).of(told, lines)}") from error
     return recordings
 
 
 def _name_of(source: str | Path | pd.DataFrame) -> str:
     if not isinstance(source, pd.DataFrame | str | os.PathLike):
         raise TypeError(f"expected a DataFrame or the path of a file, got {type(source).__name__}")
-    return "DataFrame" if isinstance(source, pd.DataFrame) else str(source)
-
-
-def _recordings(source: str, table: pd.DataFrame, known: Recognised, file_format: FileFormat) -> list[Recording]:
-    vain = {f"--units {quantity}=" for quantity, column in known.columns.items() if column.unit}
-    vain |= {"discharge_is_negative"} if file_format.discharge_is_negative is None else set()
-    try:
-        rows = rows_of(table, known, file_format)
-        if not file_format.load:  # which is what it says
-            rows = with_signed_current(rows, known, file_format.discharge_is_negative)
-        return _split(rows, {"source": source}, frozenset(vain))
-    except ValueError as error:
-        raise known.refusal(error) from error
+    return TABLE if isinstance(source, pd.DataFrame) else str(source)
 
 
 class _Part(NamedTuple):
@@ -192,11 +172,11 @@ class _Part(NamedTuple):
     charge: slice  # the rows of the charge that ends where it begins, empty if there is none
 
 
-def _split(rows: pd.DataFrame, meta: dict[str, Any], vain: frozenset[str]) -> list[Recording]:
+def _split(rows: pd.DataFrame, origin: Origin) -> list[Recording]:
     """The discharges among some rows; what is left aside is named."""
     parts = [part for low, high in itertools.pairwise(_bounds(rows)) for part in _discharges(rows, low, high)]
     if not parts:
-        raise ValueError("there is no discharge: no charge is drawn. Check the sign of the current")
+        raise _nothing_drawn(rows)
     current_A, places = rows["current"].to_numpy(), rows.index + 1
     # what no cell can draw is refused later, and is no measure of the others
     largest_C = max((part.drawn_C for part in parts if current_A[part.rows].max() <= LOAD_LIMITS["current"]), default=0.0)
@@ -210,9 +190,20 @@ def _split(rows: pd.DataFrame, meta: dict[str, Any], vain: frozenset[str]) -> li
         say(f"left aside, as they draw less than {LOAD_SHARE:.0%} of the largest: {len(aside)} ({first})")
     parts = [part for part in parts if part.drawn_C >= LOAD_SHARE * largest_C]
     histories = [ChargeHistory(charge=_charge_before(rows, part.charge)) for part in parts]
+    meta: dict[str, Any] = {"source": origin.source}
     metas = [meta | {"cycle": number} for number in range(1, len(parts) + 1)] if len(parts) > 1 else [meta]
     found = zip(parts, histories, metas, strict=True)
-    return [_recording(rows.iloc[part.rows], history, each, len(parts) > 1, vain) for part, history, each in found]
+    return [_recording(rows.iloc[part.rows], history, each, len(parts) > 1, origin) for part, history, each in found]
+
+
+def _nothing_drawn(rows: pd.DataFrame) -> RecordError:
+    """What rows are in which no charge is drawn: a charge, if the voltage rises with it."""
+    time_s, voltage_V, current_A = (rows[name].to_numpy() for name in REQUIRED)
+    charged_Ah = -float(_passed_C(time_s, current_A)[-1]) / 3600.0
+    begin_V, end_V = voltage_V[current_A < 0.0][[0, -1]] if (current_A < 0.0).any() else (0.0, 0.0)
+    if end_V > begin_V:
+        return RecordError(f"there is no discharge, but a charge of {charged_Ah:.4g} Ah, from {begin_V:.2f} to {end_V:.2f} V")
+    return RecordError("there is no discharge, as no charge is drawn: check the sign of the current", SIGNS)
 
 
 def _bounds(rows: pd.DataFrame) -> list[int]:
@@ -315,7 +306,7 @@ def _charge_before(rows: pd.DataFrame, part: slice) -> ChargeBefore | None:
 
 
 def _recording(
-    rows: pd.DataFrame, history: ChargeHistory, meta: dict[str, Any], has_own_clock: bool, vain: frozenset[str]
+    rows: pd.DataFrame, history: ChargeHistory, meta: dict[str, Any], has_own_clock: bool, origin: Origin
 ) -> Recording:
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     if "cycle" in rows:
@@ -330,15 +321,15 @@ def _recording(
         "time_s": time_s - time_s[0] if has_own_clock else time_s,
         "voltage_V": rows["voltage"].to_numpy(),
         "current_A": current_A,
-        "history": _with_count(history, rows, vain) if "capacity" in rows else history,
+        "history": _with_count(history, rows, origin) if "capacity" in rows else history,
     }
     if "temperature" in rows and not rows["temperature"].isna().all():
         temperature_C = rows.set_index("time")["temperature"].interpolate(method="index", limit_direction="both")
         arrays["temperature_C"] = temperature_C.to_numpy()
-    return Recording(arrays, meta, vain)
+    return Recording(arrays, meta, origin)
 
 
-def _with_count(history: ChargeHistory, rows: pd.DataFrame, vain: frozenset[str]) -> ChargeHistory:
+def _with_count(history: ChargeHistory, rows: pd.DataFrame, origin: Origin) -> ChargeHistory:
     """With how much the charge under load is another one than the tester counted row by row; it may count anew with a step."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(is_load(current_A))
@@ -350,7 +341,7 @@ def _with_count(history: ChargeHistory, rows: pd.DataFrame, vain: frozenset[str]
     counted_Ah, passed_Ah = step_C[goes_on].sum() / 3600.0, passed_C[goes_on].sum() / 3600.0
     if abs(passed_Ah - counted_Ah) > FEW_SHARE * counted_Ah:
         told = f"the tester counted {counted_Ah:.4g} Ah, where current and time make {passed_Ah:.4g} Ah"
-        if "--units time=" not in vain:
+        if origin.leaves_open("time"):
             refuse_other_unit(counted_Ah, passed_Ah, told)
         say(f"{told}: check units and clock, and that all rows are there")
     return history._replace(is_counted=bool((step_C >= 0.0).all()), uncounted_C=3600.0 * abs(passed_Ah - counted_Ah))

@@ -23,7 +23,7 @@ def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
         names = ", ".join(name for name in content if not name.startswith("__"))
         where = f"one of its variables ({names}) must be a cell with its cycles" if content else error
-        raise ValueError(f"{path} is damaged, or not laid out as NASA's battery files: {where}") from error
+        raise ValueError(f"the file is damaged, or not laid out as NASA's battery files: {where}") from error
 
 
 def _samples_of_mat(cell: str, value: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:

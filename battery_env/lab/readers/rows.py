@@ -6,7 +6,7 @@ that goes back at midnight or beside dates, unusable rows, and two rows at one t
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from battery_env.lab.readers.columns import Column, FileFormat, Recognised, dire
 from battery_env.lab.readers.testers import REQUIRED
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, switches
 from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES
+from battery_env.records.refusals import Advice, RecordError
 from battery_env.records.samples import PLAUSIBLE
 
 #: What is worth less than this share of the charge is nothing.
@@ -35,7 +36,7 @@ def rows_of(table: pd.DataFrame, known: Recognised, file_format: FileFormat) -> 
     units, and in order; the current has the sign of the file.
     """
     rows = with_current(on_its_clock(in_si_units(table, known), known.columns), known.columns, file_format)
-    return in_order(without_incomplete(rows))
+    return in_order(without_incomplete(rows, known.open_questions))
 
 
 def place_of(rows: pd.DataFrame, which: BoolArray | pd.Series[bool], most: int = 10) -> str:
@@ -62,15 +63,22 @@ def in_si_units(table: pd.DataFrame, known: Recognised) -> pd.DataFrame:
     return pd.DataFrame(found, index=table.index)
 
 
-def _check_twins(found: Mapping[str, FloatArray], columns: Mapping[str, Column]) -> None:
-    """Refuse columns that have equally good names for a quantity and are not the same."""
+def _check_twins(found: dict[str, FloatArray], columns: Mapping[str, Column]) -> None:
+    """Of columns that have equally good names for a quantity take the finest; refuse them if they are not the same."""
     for key in [each for each in found if each not in _READ]:
         quantity = key.rstrip("0123456789")
-        if not np.nanmax(np.abs(found[key] - found[quantity])) <= NOTHING_SHARE * np.nanmax(np.abs(found[key])):
-            both = " and ".join(repr(columns[each].name) for each in (quantity, key))
-            raise ValueError(
-                f"both {both} may be the {quantity}: --columns {quantity}=NAME, or --ignore NAME (Python: ignore)"
+        values, others = (np.unique(found[each][np.isfinite(found[each])]) for each in (quantity, key))
+        largest = np.abs(others).max(initial=0.0)
+        # one of them may be rounded, or cut off
+        step = np.diff(min(values, others, key=len)).min(initial=FEW_SHARE * largest)
+        if not np.nanmax(np.abs(found[key] - found[quantity])) <= max(step, NOTHING_SHARE * largest):
+            names = [columns[each].name for each in (quantity, key)]
+            raise RecordError(
+                f"both {' and '.join(map(repr, names))} may be the {quantity}, and they differ",
+                [Advice(f"If it is {name!r}", "columns", {quantity: name}) for name in names],
             )
+        if len(others) > len(values):
+            found[quantity] = found[key]
 
 
 def numbers(values: pd.Series, column: Column) -> FloatArray:
@@ -119,9 +127,9 @@ def _one_cell(values: pd.Series, column: Column) -> FloatArray:
     names = values.dropna().astype(str).str.strip()
     cells = names[names != ""].unique()
     if len(cells) > 1:
-        raise ValueError(
-            f"{column.name!r} names {len(cells)} cells ({', '.join(cells[:3])}): give each a file, or in Python a table, or "
-            f"leave the column out: --ignore {column.name!r} (Python: ignore)"
+        raise RecordError(
+            f"{column.name!r} names {len(cells)} cells ({', '.join(cells[:3])}): give each a file, or in Python a table",
+            [Advice("If they are one, leave the column out", "ignore", [column.name])],
         )
     return np.zeros(len(values))
 
@@ -134,7 +142,7 @@ def seconds(values: pd.Series, column: Column) -> FloatArray:
     text = pd.Series(dtype="string") if is_number else values.astype("string").str.strip().replace({"": pd.NA})
     if 2 * text.str.contains(":").sum() <= text.notna().sum():
         found = numbers(values, column)
-        digits = len(f"{pd.Series(found).median():.0f}")
+        digits = len(f"{pd.Series(found).min():.0f}")
         if digits == 14:  # a date, as 20260227225000
             text = pd.Series(found).round().astype("Int64").astype("string")
             return _total_s(pd.to_datetime(text, format="%Y%m%d%H%M%S", errors="coerce"))
@@ -205,7 +213,8 @@ def refuse_other_unit(true: float, ticks: float, told: str) -> None:
     """Refuse a clock without a unit whose ticks another measure shows to be no seconds."""
     for unit, (symbol, tick_s) in CLOCKS.items():
         if tick_s != 1.0 and abs(true - tick_s * ticks) <= SWITCH_SHARE * true:
-            raise ValueError(f"{told}, as if the time counts {unit}: --units time={symbol}")
+            advice = Advice(f"If the time is in {unit}, state it", "units", {"time": symbol}, "time")
+            raise RecordError(f"{told}, as if the time counts {unit}: --units time={symbol}", [advice])
 
 
 def with_current(rows: pd.DataFrame, columns: Mapping[str, Column], file_format: FileFormat) -> pd.DataFrame:
@@ -229,7 +238,7 @@ def with_current(rows: pd.DataFrame, columns: Mapping[str, Column], file_format:
     return rows.assign(current=rows["power"] / voltage_V.where(voltage_V > 0.0))
 
 
-def without_incomplete(rows: pd.DataFrame) -> pd.DataFrame:
+def without_incomplete(rows: pd.DataFrame, open_questions: Collection[str]) -> pd.DataFrame:
     """
     Without rows that hold no measurement, as blanks, titles, headers that come again, and those at the ends in which no cell
     is connected; and without a few in which the time, the voltage or the current is missing, or none that a cell has.
@@ -239,12 +248,15 @@ def without_incomplete(rows: pd.DataFrame) -> pd.DataFrame:
     is_no_cell = (rows["voltage"] < 0.1 * rows["voltage"].median()) & (rows["current"].abs() <= rest_A)
     is_measured = is_known.any(axis=1) & ~(is_no_cell & (is_no_cell.cummin() | is_no_cell[::-1].cummin()))
     faults = {f"the {name} is missing": ~is_known[name] & is_measured for name in REQUIRED}
-    for name, (low, high, unit, _) in zip(("voltage", "current"), PLAUSIBLE.values(), strict=False):
+    most = max(2, int(FEW_SHARE * len(rows)))
+    for name, (low, high, unit) in zip(("voltage", "current"), PLAUSIBLE.values(), strict=False):
         size, is_of_cell = rows[name].abs(), rows[name].between(low, high)
-        beyond = is_known[name] & ~is_of_cell & (size > 10.0 * size[is_of_cell].max())
-        if 10 * beyond.sum() <= len(rows):  # many, or near ones, are of another unit
+        beyond = is_known[name] & ~is_of_cell
+        if beyond.sum() > most and name in open_questions:  # near ones are of another unit
+            beyond &= size > 10.0 * size[is_of_cell].max()
+        if 10 * beyond.sum() <= len(rows):
             faults[f"the {name} lies beyond {low:g} .. {high:g} {unit}"] = beyond
-    is_faulty, most = np.any([*faults.values()], axis=0), max(2, int(FEW_SHARE * len(rows)))
+    is_faulty = np.any([*faults.values()], axis=0)
     faults["there is no measurement of a cell"] = ~is_measured
     told = "; ".join(f"{fault} in row {place_of(rows, bad)}" for fault, bad in faults.items() if bad.any())
     if is_faulty.sum() > most:
@@ -274,7 +286,7 @@ def in_order(rows: pd.DataFrame) -> pd.DataFrame:
         first = int(np.argmax(back))
         raise ValueError(
             f"the clock goes back: row {place_of(rows, back)} is at {time_s[first]:g} s, after {time_s[first - 1]:g} s. Give "
-            "the time since the start of the test, or dates in UTC; number tests in a column of the cycle, or give each a file"
+            "the time since the start of the test, or dates in UTC. Number tests in a column of the cycle, or give each a file"
         )
     same = step_s == 0.0
     is_switched = np.isin(np.arange(len(rows)), switches(rows["current"].to_numpy()) + 1)

@@ -7,6 +7,8 @@ import pandas as pd
 
 from battery_env.lab.readers.columns import Recognised
 from battery_env.records import LOAD_SHARE, REST_CURRENT_A, SWITCH_SHARE, switches
+from battery_env.records.refusals import RecordError
+from battery_env.records.samples import SIGNS
 
 #: What changes the voltage by more than this share of its range is much.
 MUCH_SHARE = 0.25
@@ -37,10 +39,10 @@ def with_signed_current(rows: pd.DataFrame, known: Recognised, is_negative: bool
         clear = [each for each in (words, jumps) if abs(each) > _CLEAR]
         is_negative = clear[0] < 0.0 if clear else known.tester.discharge_is_negative
         if is_negative is None or min(clear, default=0.0) < 0.0 < max(clear, default=0.0):
-            raise ValueError(
+            raise RecordError(
                 "whether the current of a discharge is positive or negative cannot be told, as words and jumps of the voltage "
-                f"do not say so clearly, or contradict each other ({words:.2f}, {jumps:.2f}). State it: "
-                "--discharge-is-negative or --discharge-is-positive (Python: discharge_is_negative)"
+                f"do not say so clearly, or contradict each other ({words:.2f}, {jumps:.2f})",
+                SIGNS,
             )
     return rows.assign(current=-current_A) if is_negative else rows
 

@@ -19,9 +19,10 @@ from typing import IO, Any, NamedTuple, TypeVar, cast
 import numpy as np
 import pandas as pd
 
-from battery_env.files import LARGEST_UNPACKED_BYTES
+from battery_env.files import LARGEST_UNPACKED_BYTES, kind_of
 from battery_env.lab.readers.columns import FileFormat, Recognised, are_units, count_required, say
 from battery_env.lab.readers.testers import ENCODINGS, REQUIRED
+from battery_env.records.refusals import Advice, RecordError
 
 Key = TypeVar("Key")
 
@@ -151,10 +152,8 @@ def _text_of(path: Path) -> bytes:
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         content = content.decode("utf-16", errors="ignore").encode()
     kept = content.rstrip(b"\0")  # what a power cut leaves of the end
-    if 10 * kept.count(b"\0") > len(kept):
-        raise ValueError(
-            "the file is binary, and none of those that can be read: export the records as CSV, a workbook as .xlsx"
-        )
+    if kind := kind_of(content) or "binary" * (10 * kept.count(b"\0") > len(kept)):
+        raise RecordError(f"the file is {kind}, and no table", [Advice("Export the records as CSV, a workbook as .xlsx")])
     kept = kept.replace(b"\0", b"")
     if len(kept) < len(content):
         say(f"{len(content) - len(kept)} NUL bytes, which are no text, are left out")
@@ -223,7 +222,7 @@ def _read_text(content: bytes, options: dict[str, Any], found: Recognised) -> pd
                 **options,
             )
     except Exception as error:  # pandas raises whatever the damage leads it to
-        raise found.refusal(f"the file is damaged, or no table: {str(error).strip()}") from error
+        raise RecordError(f"the file is damaged, or no table: {str(error).strip()}") from error
     table = table.reindex(columns=positions)
     if options["decimal"] == ",":  # words among numbers make text of all
         table = table.replace(_ITS_COMMA, r"\1.", regex=True)
