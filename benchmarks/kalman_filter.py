@@ -35,13 +35,14 @@ from battery_env.electrochemistry.tangents import (
     step_with_tangents,
     voltage_tangents,
 )
-from battery_env.estimates import Estimate
+from battery_env.estimates import Estimate, Finding
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
 from battery_env.records import check_sample
 
 #: Standard deviations before a discharge: of ``q_mobile`` as a share of the cell's, of ``r_o`` (ohm), and of an offset (V).
 PRIOR_SD_SHARE_Q, PRIOR_SD_R_OHM, OFFSET_SD_V = 0.25, 0.15, 0.005
+_NO_VERDICT = (Finding("other", measured={"message": "This filter has no verdict."}),)
 
 
 class PlainKalmanFilter(OnlineEstimator):
@@ -99,7 +100,7 @@ class PlainKalmanFilter(OnlineEstimator):
         )
         self._before_A = current_A
         (q_mobile, r_o, _), (sd_q, sd_r_o, _) = self._mean.tolist(), np.sqrt(np.diag(self._covariance)).tolist()
-        return Estimate(q_mobile, r_o, sd_q, sd_r_o, settled=False, reason="This filter has no verdict.")
+        return Estimate(q_mobile, r_o, sd_q, sd_r_o, settled=False, findings=_NO_VERDICT)
 
 
 @compiled

@@ -49,7 +49,7 @@ BELOW = {
     "own_problem": ("own_env",),
     "train_fast": ("zoo", "tensorboard", "onnx", "own_algorithm", "cluster"),
     "cost_environments": tuple(f"environments/{env_id}" for env_id in CONTROL_IDS),
-    "real_cells": ("tester_files", "own_cell", "forecasts", "streaming", "pretrained"),
+    "real_cells": ("findings", "tester_files", "own_cell", "forecasts", "streaming", "pretrained"),
     "parameters": ("identifiability",),
     "battery_env": (
         "compare_calibrators",

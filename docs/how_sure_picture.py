@@ -13,7 +13,7 @@ import numpy as np
 
 from battery_env import LeastSquares, Settings, load_nasa_discharges
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
-from battery_env.estimators.reasons import SETTLED_SHARES
+from battery_env.estimates.findings import SETTLED_SHARES
 from battery_env.plotting import COLOURS, new_figure, save_figure
 from battery_env.records import drawn
 from docs.environment_pictures import PICTURES

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from battery_env.__main__ import calibrate
-from battery_env.estimators.reasons import Doubt, Reason
+from battery_env.estimates.findings import CODES, Finding
 from battery_env.parameters import PARAMETER_NAMES
 from checks.pages import DOCS, PAGES, ROOT, blocks, docstring_examples
 from sb3_lac.checks import advice_for_a_time_limit
@@ -122,11 +122,17 @@ def test_commands_of_the_calibrator_run_and_exit_as_their_page_says(tmp_path, mo
         assert calibrate(words[1:]) == int(status[1] if status else 0), line
 
 
-def test_reasons_can_be_looked_up_by_their_own_words():
-    text = (DOCS / "real_cells.md").read_text(encoding="utf-8")
-    named = [words for row in re.findall(r"^\| (\".*?) \|", text, flags=re.MULTILINE) for words in re.findall('"(.*?)"', row)]
-    texts = [row.text for row in (*Reason, *Doubt)] + [Reason.IMPRECISE.said(number, {}) for number in PARAMETER_NAMES]
-    assert named and not [words for words in named if not any(words in text for text in texts)]
+def test_each_finding_has_a_row_of_remedies_by_its_code_and_its_own_words():
+    rows = re.findall(r"^\| (`.*?) \| (.*?) \|", (DOCS / "findings.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    codes = [re.findall("`(.*?)`", first) for first, _ in rows]
+    assert sorted(code for of_row in codes for code in of_row) == sorted(CODES)
+    for of_row, (_, says) in zip(codes, rows, strict=True):
+        texts = [CODES[code].text for code in of_row]
+        if of_row == ["imprecise"]:
+            texts = [str(Finding("imprecise", number)) for number in PARAMETER_NAMES]
+        words = re.findall('"(.*?)"', says)
+        assert of_row == ["other"] or [len([each for each in words if each in text]) for text in texts] == [1] * len(texts)
+        assert all(any(each in text for text in texts) for each in words), words
 
 
 def test_what_the_summaries_of_a_loop_say_against_it_has_a_row_of_remedies_each():

@@ -8,8 +8,8 @@ import numpy as np
 
 from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, QNS, VO, CellParameters, Trajectory
 from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimates.findings import SETTLED_SHARES, Reason
 from battery_env.estimators.estimator import Estimator
-from battery_env.estimators.reasons import SETTLED_SHARES, Reason
 from battery_env.estimators.verdict import Diagnosis, is_plausible
 
 

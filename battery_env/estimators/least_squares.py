@@ -17,13 +17,13 @@ from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES,
 from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_errors, memory_share
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
+from battery_env.estimates.findings import Reason
 from battery_env.estimators.diagnosis.evidence import dropouts_s, evidence_of, measured, unseen_C
 from battery_env.estimators.diagnosis.faults import MOST_NOISE_SD
 from battery_env.estimators.diagnosis.knee import knee_sd_C
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
-from battery_env.estimators.reasons import Reason
 from battery_env.estimators.search import (
     MARGIN,
     AnyPrior,
@@ -105,7 +105,7 @@ class LeastSquares(Estimator):
     ``r_o``: what the record does not tell apart is in the standard deviations of the parameters.
 
     *Settled* (:class:`~battery_env.Estimate`) means that the record alone determines every parameter searched for, with a
-    standard deviation below :data:`~battery_env.estimators.reasons.SETTLED_SHARES` of its value without any prior, and that
+    standard deviation below :data:`~battery_env.estimates.findings.SETTLED_SHARES` of its value without any prior, and that
     nothing contradicts it: the start, gaps and steps of the voltage, its fit, bounds, and a prior. An estimate that rests on a
     prior is not settled: it is as good as the prior.
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
+from battery_env.estimates.findings import CODES, MOST_OF_SD, SETTLED_SHARES, Doubt, Finding, Reason
 from battery_env.estimators.diagnosis.evidence import (
     EVIDENCE,
     charges_in_doubt_C,
@@ -22,7 +23,6 @@ from battery_env.estimators.diagnosis.evidence import (
     start_reason,
 )
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V, Row, table
-from battery_env.estimators.reasons import MOST_OF_SD, SETTLED_SHARES, Doubt, Reason
 from battery_env.parameters import PARAMETER_NAMES
 
 #: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
@@ -73,9 +73,8 @@ def _note_one(judged: Row, k: int, reason: int, about: int, holds: bool) -> None
 
 @compiled
 def note(judged: Row, reason: int, holds: bool) -> None:
-    """Note a reason against both numbers, if it holds."""
-    _note_one(judged, 0, reason, 0, holds)
-    _note_one(judged, 1, reason, 1, holds)
+    """Note a reason against both numbers, if it holds, that names none of them."""
+    note_about(judged, -1, reason, holds)
 
 
 @compiled
@@ -132,20 +131,21 @@ class Verdict(NamedTuple):
 
     settled_q_mobile: bool
     settled_r_o: bool
-    reason: str
+    findings: tuple[Finding, ...]
 
     @classmethod
     def of(cls, judged: Any, measured: Mapping[str, Any]) -> Verdict:
-        """What follows from a row of ``JUDGED``; texts are filled with what was measured."""
-        texts = []
-        for k in range(len(PARAMETER_NAMES)):
-            reason, known = Reason(judged["reason"][k]), dict(measured)
+        """What follows from a row of ``JUDGED``, with what was measured."""
+        found = []
+        for k, about in enumerate(judged["about"].tolist()):
+            reason, name = Reason(judged["reason"][k]), "" if about < 0 else PARAMETER_NAMES[about]
             if reason is Reason.IN_DOUBT:
-                known["in_doubt"] = judged["in_doubt"][k]
-                known["doubt"] = Doubt(judged["doubt"][k]).text.format_map(measured)
-            texts.append(reason.said(PARAMETER_NAMES[judged["about"][k]], known))
-        in_order = dict.fromkeys(reversed(texts) if judged["r_o_comes_first"] else texts)
-        return cls(not texts[0], not texts[1], " ".join(filter(None, in_order)))
+                found.append(Finding.of(Doubt(judged["doubt"][k]), name, judged["in_doubt"][k], **measured))
+            else:
+                found.append(Finding.of(reason, name, **measured))
+        settled_q_mobile, settled_r_o = (each.code not in CODES for each in found)
+        in_order = dict.fromkeys(reversed(found) if judged["r_o_comes_first"] else found)
+        return cls(settled_q_mobile, settled_r_o, tuple(each for each in in_order if each.code in CODES))
 
 
 class Diagnosis:

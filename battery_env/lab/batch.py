@@ -27,6 +27,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import pandas as pd
 
+from battery_env.estimates.findings import codes_of, findings_of
 from battery_env.files import check_folder, locked, replacing
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.readers.columns import FileFormat
@@ -251,7 +252,8 @@ class Outcome:
     def of_row(cls, row: Mapping[str, Any], settings: Settings) -> Outcome:
         """The same, of a discharge that could be used."""
         own = {field.name for field in fields(cls)}
-        columns = {name: value for name, value in row.items() if name not in own - {"cycle"}}
+        columns = {name: value for name, value in row.items() if name not in own - {"cycle"} | {"reason"}}
+        columns["findings"] = findings_of(row["findings"])
         return cls(found=Calibration(settings, **columns), **{name: row[name] for name in own & row.keys()})
 
 
@@ -387,7 +389,7 @@ class Results:
         """Write the table of all rows, if any discharge could be used, and if several are whole a figure of them."""
         if not self.has_numbers:
             return
-        table = pd.DataFrame(self._sorted_rows()).astype(_TYPES)
+        table = with_codes(pd.DataFrame(self._sorted_rows())).astype(_TYPES)
         self.write(TABLE, partial(table.to_csv, index=False))
         whole = table[table["measured_eod_time_s"].notna()]
         if len(whole) > 1:
@@ -400,6 +402,12 @@ class Results:
     def has_numbers(self) -> bool:
         """Whether any discharge could be used."""
         return any(not row["error"] for row in self._rows.values())
+
+
+def with_codes(table: pd.DataFrame) -> pd.DataFrame:
+    """A table of rows with the codes of findings alone, as files have it."""
+    of_row = table["findings"]
+    return table.assign(findings=[codes_of(findings_of(each)) if isinstance(each, list) else "" for each in of_row])
 
 
 def _by_date(keys: Sequence[str], starts: Mapping[str, str]) -> list[str]:

@@ -21,7 +21,8 @@ from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.ends import quantile
-from battery_env.estimates import Estimate
+from battery_env.estimates import Estimate, Finding
+from battery_env.estimates.findings import Reason
 from battery_env.estimators.diagnosis.evidence import evidence_of, fault_reason, start_reason
 from battery_env.estimators.diagnosis.gaps import doubtful_C
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
@@ -142,7 +143,7 @@ def calibrated(
     known, usual_C = (settings, None) if is_whole else (settings.with_nominal_cell(), settings.usual_q_mobile_C)
     part = _look_at(discharge, known)
     if end_is_asked and _is_below_all_sizes(part):
-        raise ValueError(_below_all_sizes())
+        raise ValueError(Reason.BELOW_ALL_SIZES.text)
     estimate, method, model = _estimate(part, known, usual_C)
     # a cell in progress has not ended, however low its model comes in the pulses before
     cut_off_V, current_A = (-np.inf, 0.0) if part.in_progress else (settings.resolved.cut_off_V, part.load.mean_A)
@@ -152,7 +153,7 @@ def calibrated(
     if end_is_asked or np.isfinite(sized.q_mobile):  # what has no size has no end
         end = _end(part, estimate, replace(known, method=method), model, shown, load, samples, end_is_asked)
     charge = _charge(part, settings, estimate, end)
-    if part.start.reason or part.more_C or not _is_all_logged(part, known, shown, estimate):
+    if part.start.findings or part.more_C or not _is_all_logged(part, known, shown, estimate):
         charge = dict.fromkeys(charge, float("nan"))
     nominal_Ah = _nominal_Ah(model, settings, part.load.mean_A)
     eod_s, sd_eod_s = (shown.eod_time_s, float("nan")) if end is None else _middle(end.eod_time_s, estimate)
@@ -166,7 +167,7 @@ def calibrated(
         settled=sized.settled,
         settled_q_mobile=sized.settled_q_mobile,
         settled_r_o=sized.settled_r_o,
-        reason=sized.reason,
+        findings=sized.findings,
         initial_soc=part.start.soc,
         sd_initial_soc=part.start.sd_soc,
         samples=len(part.loaded.time_s),
@@ -230,9 +231,9 @@ def _estimate(part: _LoadedPart, settings: Settings, usual_q_mobile_C: float | N
         estimate = calibrator.estimate(part.fitted)
     if isinstance(calibrator, PolicyEstimator):
         cell, thermal = calibrator.cell, False
-    if doubt := part.start.reason or settings.other_load(mean_current_A(part.record)):
+    if doubts := part.start.findings or settings.other_load(mean_current_A(part.record)):
         # of the charge: the resistance, which is settled within 30 %, is not in question
-        estimate = replace(estimate, settled_q_mobile=False, reason=" ".join(filter(None, [estimate.reason, doubt])))
+        estimate = replace(estimate, settled_q_mobile=False, findings=(*estimate.findings, *doubts))
     model = RecordModel(cell, thermal, initial_soc=part.start.soc)
     return estimate, settings.method or "least-squares", model
 
@@ -246,12 +247,6 @@ def _is_below_all_sizes(part: _LoadedPart) -> bool:
     return bool(shown.at_samples_V[-1] > part.fitted.voltage_V[-1])
 
 
-def _below_all_sizes() -> str:
-    return (
-        f"Cells below {_SMALLEST.q_mobile / 3.6:.0f} mAh are not modelled, nor fitted: what was drawn is known, and no more."
-    )
-
-
 def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Estimate:
     """Without numbers where the search ended at its bound, as for a cell of far another size: a bound is no result."""
     low_C, high_C = settings.q_mobile_bounds_C
@@ -259,10 +254,8 @@ def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Esti
     if low_C < near * estimate.q_mobile < near**2 * high_C:
         return estimate
     nothing: dict[str, Any] = dict.fromkeys(("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"), float("nan"))
-    reason = estimate.reason
-    if drawn_C < _SMALLEST.q_mobile:
-        reason = _below_all_sizes()
-    return replace(estimate, **nothing, reason=reason)
+    findings = (Finding.of(Reason.BELOW_ALL_SIZES),) if drawn_C < _SMALLEST.q_mobile else estimate.findings
+    return replace(estimate, **nothing, findings=findings)
 
 
 def _end(
@@ -305,9 +298,8 @@ def _end(
 def _notes(part: _LoadedPart, estimate: Estimate, settings: Settings, shown: VoltageForecast, load_A: float) -> Iterator[str]:
     """What a forecast rests on, beyond the last sample under load."""
     other_load, seen_s, rmse_V = settings.other_load(load_A), float(part.record.time_s[-1]), _rmse_V(shown, part.record)
-    # which is said where the load so far is another one, too
-    if other_load and other_load not in estimate.reason:
-        yield other_load
+    # which is found where the load so far is another one, too
+    yield from (str(each) for each in other_load if each not in estimate.findings)
     if float(part.discharge.time_s[-1]) > seen_s:
         yield f"What was recorded after the last sample under load, at {seen_s:.0f} s, is left out."
     if settings.usual_q_mobile_C is not None and settings.nominal_Ah is None and settings.method != "policy":

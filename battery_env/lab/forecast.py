@@ -16,7 +16,7 @@ from battery_env.electrochemistry import NEW_CELL
 from battery_env.electrochemistry.ends import BAND, Cells, Ends, follow, quantile, run_down
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.estimates import Estimate
-from battery_env.estimators.reasons import is_only_imprecise
+from battery_env.estimates.findings import is_only_imprecise
 from battery_env.estimators.verdict import white_noise_V
 from battery_env.loads import BlockBootstrap, Cycle, KnownLoad, Load, LoadToCome, RandomLoad, known_load, steadier_unit
 from battery_env.parameters import Q_MOBILE, R_O
@@ -275,7 +275,7 @@ def _notes(estimate: Estimate, record: Samples, goes_on_varied: bool) -> list[st
             f"The load varied: its means over quarters of the record lie {sd_A:.2g} A apart (root mean square). "
             "The interval is that of a load that goes on so, not of one that drifts elsewhere. Give the load if it is known."
         )
-    if not estimate.settled and is_only_imprecise(estimate.reason):
+    if not estimate.settled and is_only_imprecise(estimate.findings):
         notes.append(
             "The record alone does not tell both numbers yet, as before a knee: the interval counts that. `reason` says more."
         )

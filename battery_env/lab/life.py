@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,9 +22,9 @@ from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
+from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.reasons import is_only_imprecise
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome
 from battery_env.records import VARIED_SHARE, DischargeStart, drawn, drawn_charge_C, mean_current_A
@@ -34,7 +33,9 @@ from battery_env.records.discharge import Discharge
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
-_COLUMNS = "cycle q_mobile_C sd_q_mobile_C r_o_ohm settled reason valid capacity_Ah mean_current_A lasted_share".split()
+_COLUMNS = (
+    "cycle q_mobile_C sd_q_mobile_C r_o_ohm settled findings reason valid capacity_Ah mean_current_A lasted_share".split()
+)
 # Lives that are simulated, and discharges to look ahead.
 _LIVES, _MOST = 2000, 2000
 
@@ -48,10 +49,10 @@ class Life:
     their numbers leave discharges out, the walk goes on through these.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
-        ``r_o_ohm``, ``settled``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off),
-        ``mean_current_A``, ``lasted_share`` (its duration, as a share of the model's at this ``q_mobile``; NaN if it was cut
-        short), and what the discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN
-        for the first)
+        ``r_o_ohm``, ``settled``, ``findings``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the
+        cut-off), ``mean_current_A``, ``lasted_share`` (its duration, as a share of the model's at this ``q_mobile``; NaN if it
+        was cut short), and what the discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and
+        ``expected_sd_C`` (NaN for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of an estimate beside the others, likewise
     :param drift_share: mean step
@@ -233,8 +234,8 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
         try:
             rows.append(row | _row_of(discharge, cut_off_V, held))
         except ValueError as error:  # of one that cannot be used
-            rows.append(row | {"settled": False, "valid": False, "reason": str(error)})
-    life = life_of(pd.DataFrame(rows, columns=_COLUMNS))
+            rows.append(row | {"settled": False, "valid": False, "findings": (Finding.of(Reason.OTHER, message=str(error)),)})
+    life = life_of(pd.DataFrame([{**row, "reason": reason_of(row["findings"])} for row in rows], columns=_COLUMNS))
     last = discharges[int(np.flatnonzero(life.table["valid"])[-1])]
     estimate = unsure.estimate(last.loaded_part(cut_off_V))
     return replace(life, sd_share=estimate.sd_q_mobile / estimate.q_mobile, usual_start=usual_start)
@@ -264,8 +265,8 @@ def _row_of(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) ->
         "sd_q_mobile_C": estimate.sd_q_mobile,
         "r_o_ohm": estimate.r_o,
         "settled": estimate.settled,
-        "reason": estimate.reason,
-        "valid": estimate.settled or (not isnan(measured_s) and is_only_imprecise(estimate.reason)),
+        "findings": estimate.findings,
+        "valid": estimate.settled or (not isnan(measured_s) and is_only_imprecise(estimate.findings)),
         "capacity_Ah": capacity_Ah,
         "mean_current_A": mean_current_A(record),
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
@@ -276,7 +277,7 @@ def life_of(table: pd.DataFrame) -> Life:
     """Follow ``q_mobile`` over the rows of a table, as :class:`Life` has it."""
     valid = table["valid"].to_numpy(dtype=np.bool_)
     if not valid.any():
-        raise ValueError(f"no discharge determines q_mobile. {_most_common(table['reason'])}")
+        raise ValueError(f"no discharge determines q_mobile. {_most_common(table['findings'])}")
     readings, passed = np.log(table["q_mobile_C"].to_numpy()), _passed(table["cycle"])
     first = int(np.flatnonzero(valid)[0])
     centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
@@ -302,11 +303,11 @@ def _passed(numbers: pd.Series) -> FloatArray:
     return np.where(passed > 1.0, passed, 1.0)
 
 
-def _most_common(reasons: pd.Series) -> str:
-    """The reason that most discharges share, but for the numbers in it."""
-    kinds = [re.sub(r"\d+", "", reason) for reason in reasons]
+def _most_common(findings: pd.Series) -> str:
+    """What was found of most discharges, as of the first of them."""
+    kinds = [tuple(each.code for each in of_one) for of_one in findings]
     kind, count = Counter(kinds).most_common(1)[0]
-    return f"Of {count} of {len(kinds)}: {reasons.iloc[kinds.index(kind)]}"
+    return f"Of {count} of {len(kinds)}: {reason_of(findings.iloc[kinds.index(kind)])}"
 
 
 @compiled

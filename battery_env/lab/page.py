@@ -12,7 +12,7 @@ import plotly.graph_objects as go
 import streamlit as st
 from plotly.colors import qualitative
 
-from battery_env.lab.batch import attempt
+from battery_env.lab.batch import attempt, with_codes
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.life import Life, life_before
 from battery_env.lab.readers.columns import FileFormat, recognise
@@ -160,8 +160,8 @@ def show_numbers(says: Calibration) -> None:
     for place, (label, name) in zip(places, columns.items(), strict=True):
         sd = "" if np.isnan(getattr(says, name)) else f"sd {says.sd_of(name) or 'not stated'}"
         place.metric(label, says.shown(name), sd, "off", delta_arrow="off")
-    settled.metric("settled", says.state.removesuffix(" settled").replace("settled", "yes"))
-    if says.reason:
+    settled.metric("settled", "yes" if says.settled else f"only {says.settled_alone}" if says.settled_alone else "no")
+    if says.findings:
         st.error(f"Not settled: {says.reason}")
 
 
@@ -244,7 +244,7 @@ def main() -> None:
     short = [{label: each.says.shown(name, with_unit=False) for label, name in SHORT.items()} for each in found]
     settled = [each.says.state for each in found]
     st.dataframe(table[["record", "cell"]].join(pd.DataFrame(short)).assign(settled=settled), hide_index=True)
-    st.download_button("the table with all columns as CSV", table.to_csv(index=False), "estimate.csv", "text/csv")
+    st.download_button("the table with all columns as CSV", with_codes(table).to_csv(index=False), "estimate.csv", "text/csv")
 
 
 if __name__ == "__main__":

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
-from battery_env.estimators.reasons import SETTLED_SHARES
+from battery_env.estimates.findings import SETTLED_SHARES, Finding, reason_of
 from battery_env.lab.forecast import Forecast, decimals
 from battery_env.lab.settings import Settings
 from battery_env.parameters import PARAMETERS
@@ -51,7 +51,7 @@ class Calibration:
     settled: bool = quantity("settled")
     settled_q_mobile: bool = quantity("q_max")
     settled_r_o: bool = quantity("R_o")
-    reason: str = quantity("Not settled")
+    findings: tuple[Finding, ...] = quantity()
     initial_soc: float = quantity("charge at the start", "%", 1, 100.0)
     sd_initial_soc: float = quantity("sd", "%", 1, 100.0)
     samples: int = quantity("samples")
@@ -84,9 +84,15 @@ class Calibration:
     def _name(self) -> str:
         return "discharge" if self.cycle is None else f"discharge {self.cycle}"
 
+    @property
+    def reason(self) -> str:
+        """The findings as one text, which says what to do."""
+        return reason_of(self.findings)
+
     def row(self) -> dict[str, Any]:
-        """The columns by name."""
-        return {name: getattr(self, name) for name in _HOW}
+        """The columns by name; each finding is a dictionary, and at last is what they say."""
+        columns = {name: getattr(self, name) for name in _HOW}
+        return columns | {"findings": [asdict(each) for each in self.findings], "reason": self.reason}
 
     def shown(self, name: str, digits: int | None = None, with_unit: bool = True) -> str:
         """A column for readers."""
@@ -146,7 +152,7 @@ def text_of(name: str, found: Calibration) -> str:
         line = f"  {_HOW[column]['text'].format(found.settings.resolved):<22}{found.shown(column):>12}"
         lines.append(f"{line}   {remark}" if remark else line)
     if not found.settled:
-        lines += ["", f"{_HOW['reason']['text']}: {found.reason}"]
+        lines += ["", f"Not settled: {found.reason}"]
         if found.in_progress and not found.settled_q_mobile and found.settings.prior_q_mobile_C is None:
             lines.append("Or give the earlier discharges of this cell: battery-calibrate forecast FILE --life FOLDER")
     return "\n".join(lines)
@@ -211,7 +217,7 @@ def _numbers(found: Calibration) -> list[str]:
 
 def line_of(name: str, found: Calibration) -> str:
     """The same in one line."""
-    return f"{name:<18} " + "  ".join([*_numbers(found), f"{found.state}: {found.reason}".removesuffix(": ")])
+    return f"{name:<18} " + "  ".join([*_numbers(found), f"{found.state}: {found.reason}" if found.findings else found.state])
 
 
 def title_of(name: str, found: Calibration) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import pandas as pd
 
 from battery_env.checks import LoadUnit
 from battery_env.electrochemistry.ends import BAND, quantile
-from battery_env.estimators.reasons import is_only_imprecise
+from battery_env.estimates.findings import is_only_imprecise
 from battery_env.files import finite_or_none, replacing
 from battery_env.lab.calibrate import calibrated
 from battery_env.lab.forecast import Forecast, decimals
@@ -56,7 +56,7 @@ class End:
     @property
     def contradicted(self) -> bool:
         """Whether something in the record contradicts the estimate; one that is only imprecise has a wide interval."""
-        return not self.calibration.settled and not is_only_imprecise(self.calibration.reason)
+        return not self.calibration.settled and not is_only_imprecise(self.calibration.findings)
 
     def row(self) -> dict[str, Any]:
         """All of it by name, with units; of what is uncertain the quantiles ``probability``."""
@@ -74,6 +74,7 @@ class End:
             "record": self.name,
             "method": self.calibration.method,
             "settled": self.calibration.settled,
+            "findings": [asdict(each) for each in self.calibration.findings],
             "reason": self.calibration.reason,
             "load": found.load_name,
             "cut_off_V": found.cut_off_V,

@@ -15,10 +15,10 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.estimates.findings import Finding, Reason
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.reasons import Reason
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import CUT_OFF_V, DischargeStart
@@ -197,15 +197,14 @@ class Settings:
             return self
         return replace(self, cell=cell, cell_rates_sd=RATE_PRIOR_SD)
 
-    def other_load(self, current_A: float) -> str:
+    def other_load(self, current_A: float) -> tuple[Finding, ...]:
         """Why the constants may not hold for a mean current; empty if they do."""
         if self.fit is None or self.fit.currents_A is None or not current_A > 0.0:
-            return ""
+            return ()
         low_A, high_A = self.fit.currents_A
         if low_A / _SAME_LOAD <= current_A <= high_A * _SAME_LOAD:
-            return ""
-        fitted = f"{low_A:.3g}" if low_A == high_A else f"{low_A:.3g} to {high_A:.3g}"
-        return Reason.OTHER_LOAD.text.format(load_A=current_A, fitted=fitted)
+            return ()
+        return (Finding.of(Reason.OTHER_LOAD, load_A=current_A, least_fitted_A=low_A, most_fitted_A=high_A),)
 
     def tells_new_capacity(self, current_A: float) -> bool:
         """Whether the constants tell what a new cell yields under a load: where they were fitted to this load alone."""

@@ -10,10 +10,10 @@ from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, AgingPath, cell_with
 from battery_env.estimates import Estimate
+from battery_env.estimates.findings import Reason
 from battery_env.estimators.diagnosis.evidence import evidence_of, measured, unseen_C
 from battery_env.estimators.diagnosis.faults import MOST_NOISE_SD
 from battery_env.estimators.diagnosis.rest import rest_voltage_V
-from battery_env.estimators.reasons import Reason
 from battery_env.estimators.search import square
 from battery_env.estimators.verdict import (
     MISMATCH_MARGIN,

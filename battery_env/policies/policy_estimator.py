@@ -17,8 +17,8 @@ from battery_env.electrochemistry import NEW_CELL
 from battery_env.electrochemistry.aging_path import cell_with
 from battery_env.electrochemistry.ends import SURPLUS_SHARE, Cells
 from battery_env.estimates import last_estimate
+from battery_env.estimates.findings import Finding, Reason
 from battery_env.estimators.estimator import Estimate, EstimateTrace, OnlineEstimator, Record
-from battery_env.estimators.reasons import Reason
 from battery_env.policies.confidence import Confidence
 from battery_env.policies.pretrained import pretrained_policy
 from battery_env.policies.stream import columns, on_grid, with_voltage
@@ -44,7 +44,7 @@ _STEP_S = 1.0
 def _unstated(values: FloatArray) -> Estimate:
     """Of a policy without a fit, before its first decision, and of one that is not judged."""
     q_mobile, r_o = values.tolist()
-    return Estimate(q_mobile, r_o, settled=False, reason=Reason.NOTHING_STATED.text)
+    return Estimate(q_mobile, r_o, settled=False, findings=(Finding.of(Reason.NOTHING_STATED),))
 
 
 class Predictor(Protocol):

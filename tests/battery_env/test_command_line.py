@@ -16,8 +16,8 @@ import battery_env
 from battery_env import Calibration, Discharge, PolicyEstimator, Settings, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.model_error import memory_share
+from battery_env.estimates.findings import Reason
 from battery_env.estimators.cell_fit import read_cell
-from battery_env.estimators.reasons import Reason
 from battery_env.lab.calibrate import calibrate as calibrated
 from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.settings import SettingsOptions

@@ -12,6 +12,7 @@ from battery_env import NEW_CELL, Estimate, RecordModel, forecast, initial_state
 from battery_env.__main__ import calibrate
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.estimates import Finding
 from battery_env.lab.calibrate import calibrate as calibrate_record
 from battery_env.lab.running import forecast_end, read_load
 from battery_env.lab.settings import Settings
@@ -183,8 +184,8 @@ class TestUncertainty:
 
     def test_what_is_left_out_is_said(self):
         assert ["leaves theirs out" in note for note in certain(self.record).notes] == [True]
-        unsettled = Estimate(6000.0, 0.15, 60.0, 0.03, False, "It rests on its prior.")
-        assert "It rests on its prior." in forecast(self.record, unsettled, model=MODEL, samples=5).summary()
+        unsettled = Estimate(6000.0, 0.15, 60.0, 0.03, False, (Finding("misfit"),))
+        assert "The voltage of the model is farther off" in forecast(self.record, unsettled, model=MODEL, samples=5).summary()
 
 
 @pytest.mark.parametrize("q_mobile", [2000.0, 6000.0, 20000.0])

@@ -8,6 +8,7 @@ import pytest
 
 from battery_env import Discharge, LeastSquares, Settings, calibrate, fit_cell, load_nasa_discharges, track_life
 from battery_env.electrochemistry import initial_state, simulate
+from battery_env.estimates import Finding
 from battery_env.lab.life import life_of
 from battery_env.lab.running import forecast_end
 from battery_env.records import ChargeBefore, ChargeHistory
@@ -16,7 +17,12 @@ from tests.sweeps import sweep
 
 def followed(q_mobile_C, **columns):
     table = pd.DataFrame({"q_mobile_C": q_mobile_C, "valid": True, "reason": ""})
-    known = {"cycle": np.arange(len(table)) + 1, "capacity_Ah": table["q_mobile_C"] / 3780.0, "lasted_share": 1.0}
+    known = {
+        "cycle": np.arange(len(table)) + 1,
+        "findings": [()] * len(table),
+        "capacity_Ah": table["q_mobile_C"] / 3780.0,
+        "lasted_share": 1.0,
+    }
     return life_of(table.assign(**{**known, **columns}))
 
 
@@ -98,9 +104,11 @@ class TestSeries:
             life.remaining_discharges(0.0)
         with pytest.raises(ValueError, match=r"count must lie within 1 \.\. 10, got 11"):
             life.after(11)
-        reasons = ["It rests at 3.85 V.", "Cut at 2.90 V.", "Cut at 2.80 V."]
+        said = ["It rests at 3.85 V.", "Cut at 2.90 V.", "Cut at 2.80 V."]
+        codes = ["start_unlike", "other", "other"]
+        found = [(Finding(code, measured={"message": each}),) for code, each in zip(codes, said, strict=True)]
         with pytest.raises(ValueError, match=r"no discharge determines q_mobile\. Of 2 of 3: Cut at 2\.90 V\."):
-            followed(walk(2, 3), valid=False, reason=reasons)
+            followed(walk(2, 3), valid=False, findings=found)
         with pytest.raises(ValueError, match="must have no prior"):
             track_life(TestRealCell.discharges, 2.7, LeastSquares(prior_q_mobile_C=(7000.0, 70.0)))
         with pytest.raises(ValueError, match="at least one discharge"):

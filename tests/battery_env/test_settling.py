@@ -1,13 +1,13 @@
 """What is settled, and what is said when an estimate is not: no calibrator is sure of what its record contradicts."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from battery_env import NEW_CELL, Discharge, RecordModel, initial_state, load_nasa_discharges, simulate
+from battery_env.estimates.findings import CODES, Doubt, Finding, Reason, findings_of, is_only_imprecise
 from battery_env.estimators import CellFit, Estimate, LeastSquares, fit_cell
-from battery_env.estimators.reasons import Reason, is_only_imprecise
 from battery_env.estimators.verdict import Assumptions, Diagnosis
 from battery_env.lab.settings import Settings
 from battery_env.records import DischargeStart, expected_current
@@ -176,21 +176,42 @@ def test_the_table_decides_what_is_said_first_whoever_notes_it():
         sds = {"q_mobile": share_q * values["q_mobile"], "r_o": share_r_o * values["r_o"]}
         return diagnosis.verdict(values, sds, ["q_mobile", "r_o"], known=known)
 
-    assert verdict(Diagnosis(), 0.01, 0.2) == (True, True, "")
-    scale_q, imprecise_r_o = Reason.SCALE_UNKNOWN.said("q_mobile", {}), Reason.IMPRECISE.said("r_o", {})
-    assert verdict(Diagnosis(), 0.01, 0.6) == (True, False, imprecise_r_o)
-    assert Diagnosis().verdict(values, {}) == (True, True, "")  # of numbers that are held nothing is said
+    assert verdict(Diagnosis(), 0.01, 0.2) == (True, True, ())
+    scale_q, imprecise_r_o = Finding("scale_unknown", "q_mobile"), Finding("imprecise", "r_o")
+    assert verdict(Diagnosis(), 0.01, 0.6) == (True, False, (imprecise_r_o,))
+    assert Diagnosis().verdict(values, {}) == (True, True, ())  # of numbers that are held nothing is found
     # that of the number that is farther beyond its limit
-    texts = [scale_q, imprecise_r_o]
-    assert verdict(Diagnosis(), 0.04, 0.5, gain) == (False, False, " ".join(texts))
-    assert verdict(Diagnosis(), 0.04, 0.7, gain).reason == " ".join(reversed(texts))
-    assert is_only_imprecise(" ".join(texts)) and is_only_imprecise(texts[0]) and not is_only_imprecise(f"{texts[0]} No.")
+    assert verdict(Diagnosis(), 0.04, 0.5, gain) == (False, False, (scale_q, imprecise_r_o))
+    assert verdict(Diagnosis(), 0.04, 0.7, gain).findings == (imprecise_r_o, scale_q)
     # one against both hides what is against one
     diagnosis = Diagnosis()
     diagnosis.note(Reason.MISFIT, False)
-    diagnosis.note(Reason.RISES, size=0.1, fault_s=60.0)
-    rises = "The voltage rises by 0.10 V at 60 s, where the current stays as it was."
-    assert verdict(diagnosis, 0.04, 0.7) == (False, False, rises)
+    diagnosis.note(Reason.RISES, rise_V=0.1, fault_s=60.0, unrelated_V=1.0)
+    rises = Finding("rises", measured={"rise_V": 0.1, "fault_s": 60.0})
+    assert verdict(diagnosis, 0.04, 0.7) == (False, False, (rises,))
+    assert str(rises) == "The voltage rises by 0.10 V at 60 s, where the current stays as it was."
+    assert is_only_imprecise([scale_q, imprecise_r_o]) and not is_only_imprecise([imprecise_r_o, rises])
+    assert not is_only_imprecise([]) and not is_only_imprecise([Finding("gap", "q_mobile")])
+
+
+#: All that findings are told of, but for words; names end with units.
+MEASURED = {
+    **dict.fromkeys("first_V rest_V charge_V rise_V first_A usual_A charge_A offset_A load_A change_A".split(), 0.2),
+    **dict.fromkeys("least_fitted_A most_fitted_A fault_s gap_start_s gap_end_s drawn_C moved_C missed_C".split(), 0.2),
+    **dict.fromkeys("initial_soc switches ratio".split(), 0.2),
+}
+
+
+@pytest.mark.parametrize("row", CODES.values(), ids=CODES)
+def test_a_finding_keeps_what_its_text_names_and_says_it(row):
+    size = 3.0 if isinstance(row, Doubt) else None
+    found = Finding.of(row, "q_mobile", size, **MEASURED, what="offset", message="It is broken.")
+    assert CODES[found.code] is row and len(str(found)) > 10 and "{" not in str(found)
+    assert {"in_doubt_C"} >= found.measured.keys() - MEASURED.keys() - {"what", "message"}
+    assert findings_of([asdict(found)]) == (found,)
+    for name in found.measured:  # and no more than that
+        with pytest.raises(KeyError):
+            str(replace(found, measured={each: value for each, value in found.measured.items() if each != name}))
 
 
 def test_the_table_is_short_and_in_order():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.compiled import compiled
 from battery_env.electrochemistry import NEW_CELL, CellParameters
+from battery_env.estimates.findings import SETTLED_SHARES, Reason
 from battery_env.estimators.diagnosis import gaps
 from battery_env.estimators.diagnosis.faults import (
     KEPT,
@@ -29,7 +30,6 @@ from battery_env.estimators.diagnosis.faults import (
     table,
 )
 from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, LACKING_SHARE, low_rest_voltage_V, rest_voltage_V
-from battery_env.estimators.reasons import SETTLED_SHARES, Reason
 from battery_env.records import (
     LOAD_SHARE,
     REST_CURRENT_A,
@@ -223,21 +223,22 @@ def _expect_usual(evidence: Any, own: DischargeStart, usual: DischargeStart) -> 
 
 
 def measured(evidence: Any, initial_soc: float, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
-    """What texts say of samples, by the names in their braces, on a clock of its own."""
+    """What was measured of samples, by the names that texts have in braces, on a clock of its own."""
     charge, rest = charge or ChargeBefore(nan, nan, nan, nan), evidence["rest"]
     fault, switch, gap = evidence["fault"], evidence["switch"], evidence["gap"]
     end_s = clock_s + gap["end_s"]
+    size = fault["size"] if fault["reason"] else switch["size_A"]
     return {
         "first_V": float(evidence["start"]["first_V"]),
         "rest_V": float(evidence["start_V"]),
         "first_A": float(evidence["start"]["first_A"]),
         "usual_A": float(evidence["usual_A"]),
-        "expected": "a full cell" if initial_soc == 1.0 else f"a cell with {initial_soc:.0%} of its charge",
+        "initial_soc": initial_soc,
         "charge_V": charge.highest_V,
         "charge_A": charge.last_A,
         "offset_A": rest["mean_A"],
         "fault_s": clock_s + (fault["time_s"] if fault["reason"] else switch["time_s"]),
-        "size": fault["size"] if fault["reason"] else switch["size_A"],
+        **dict.fromkeys(("drawn_C", "change_A", "rise_V"), size),  # by which fault it is
         "switches": evidence["switches"]["count"],
         "missed_C": evidence["missed_C"],
         "gap_start_s": end_s - gap["length_s"],

@@ -10,7 +10,8 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL, CellParameters, initial_state, voltage
-from battery_env.estimators.reasons import Reason
+from battery_env.estimates import Finding
+from battery_env.estimates.findings import Reason, reason_of
 from battery_env.records import REST_CURRENT_A, STEADY_S, ChargeBefore, DischargeStart, Record, Stream
 
 #: What a state of charge can be given as: a number, or (mean, standard deviation).
@@ -27,6 +28,8 @@ _SOC_GRID, _SLOPE_SPAN = np.linspace(0.02, 1.0, 1961), 0.01
 #: Sensor and model are not taken to be better than this where nothing is stated of them, V.
 LEAST_ERROR_V = 0.005
 
+_UNKNOWN = (Finding.of(Reason.START_UNKNOWN),)
+
 
 class Start(NamedTuple):
     """
@@ -35,13 +38,18 @@ class Start(NamedTuple):
     :param soc: state of charge
     :param sd_soc: its standard deviation
     :param samples: how many samples at rest it was told from; 0 where it was stated
-    :param reason: why it could not be told, empty if it could
+    :param findings: why it could not be told, empty if it could
     """
 
     soc: float
     sd_soc: float
     samples: int = 0
-    reason: str = ""
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def reason(self) -> str:
+        """The findings as one text."""
+        return reason_of(self.findings)
 
 
 def check_initial_soc(initial_soc: InitialSoc) -> tuple[float, float]:
@@ -79,7 +87,7 @@ def soc_from_rest(
     :param mismatch_V: error to expect of the model, V; at least 0.005 V are taken
     :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: as ``mismatch_V``
     :param dt_s: time between the samples of simulated records, whose current is taken as it is, s
-    :return: the state of charge. If ``reason`` is not empty, the rest does not tell it, and no estimate that relies on it is
+    :return: the state of charge. If it has ``findings``, the rest does not tell it, and no estimate that relies on it is
         settled
     :raises ValueError: if the record cannot be used
     """
@@ -87,11 +95,11 @@ def soc_from_rest(
     loaded = np.flatnonzero(np.abs(stream.current_A) > REST_CURRENT_A)
     count = int(loaded[0]) if len(loaded) else len(stream.time_s)
     if not count:
-        return Start(1.0, 0.0, 0, Reason.START_UNKNOWN.text)
+        return Start(1.0, 0.0, 0, _UNKNOWN)
     fast_V, slow_V = (_running_mean_V(stream, count, memory_s) for memory_s in _MEMORIES_S)
     rest_V = _rest_voltages_V(cell)
     if not (np.diff(rest_V) > 0.0).all():
-        return Start(1.0, 0.0, count, Reason.START_UNKNOWN.text)
+        return Start(1.0, 0.0, count, _UNKNOWN)
     soc = float(np.interp(fast_V, rest_V, _SOC_GRID))
     around = np.clip([soc - _SLOPE_SPAN, soc + _SLOPE_SPAN], _SOC_GRID[0], _SOC_GRID[-1])
     slope_V = float(np.diff(np.interp(around, _SOC_GRID, rest_V))[0] / np.diff(around)[0])
@@ -99,7 +107,7 @@ def soc_from_rest(
     sensor_sd_V = model_sd_V if voltage_noise_V is None else voltage_noise_V
     sd_V = np.hypot(np.hypot(sensor_sd_V, model_sd_V), _STILL_TO_COME * (fast_V - slow_V))
     rest_s = float(stream.time_s[count - 1] - stream.time_s[0])
-    return Start(soc, float(sd_V / slope_V), count, "" if rest_s >= STEADY_S else Reason.START_UNKNOWN.text)
+    return Start(soc, float(sd_V / slope_V), count, () if rest_s >= STEADY_S else _UNKNOWN)
 
 
 def starting_alike(records: Sequence[Record]) -> list[Record]:

@@ -1,4 +1,4 @@
-"""What every calibrator returns."""
+"""An estimate, and the estimates over a discharge."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from battery_env.arrays import BoolArray, FloatArray, StringArray
+from battery_env.estimates.findings import Finding, reason_of
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Estimate:
     :param sd_r_o: likewise, ohm
     :param settled: whether the data determine the estimate, and nothing in the record contradicts it: a fully charged cell
         says nothing about ``q_mobile``, and a prior alone settles nothing. Both numbers are settled then
-    :param reason: why it is not settled, in a sentence or two, the largest doubt first; empty if it is
+    :param findings: why it is not settled, the largest doubt first; empty if it is
     :param settled_q_mobile: whether ``q_mobile`` is settled, though ``r_o`` may not be; where ``settled`` is false and nothing
         is said of either number, neither is
     :param settled_r_o: likewise
@@ -35,7 +36,7 @@ class Estimate:
     sd_q_mobile: float = float("nan")
     sd_r_o: float = float("nan")
     settled: bool = True
-    reason: str = ""
+    findings: tuple[Finding, ...] = ()
     settled_q_mobile: bool = True
     settled_r_o: bool = True
     constants: Mapping[str, float] | None = None
@@ -46,6 +47,11 @@ class Estimate:
         elif not self.settled:
             object.__setattr__(self, "settled_q_mobile", False)
             object.__setattr__(self, "settled_r_o", False)
+
+    @property
+    def reason(self) -> str:
+        """The findings as one text, which says what to do."""
+        return reason_of(self.findings)
 
     def within(self, low_C: float, high_C: float) -> Estimate:
         """
@@ -81,7 +87,7 @@ class EstimateTrace:
     :param sd_q_mobile: stated standard deviations, C
     :param sd_r_o: likewise, ohm
     :param settled: whether the calibrator takes each estimate for settled
-    :param reason: why each is not, strings, empty for those that are
+    :param findings: why each is not, empty for those that are
     :param settled_q_mobile: whether it takes each ``q_mobile`` for settled
     :param settled_r_o: likewise
     :param constants: what else was found with each, as of :class:`Estimate`
@@ -93,7 +99,7 @@ class EstimateTrace:
     sd_q_mobile: FloatArray | None = None
     sd_r_o: FloatArray | None = None
     settled: BoolArray | None = None
-    reason: StringArray | None = None
+    findings: Sequence[tuple[Finding, ...]] | None = None
     settled_q_mobile: BoolArray | None = None
     settled_r_o: BoolArray | None = None
     constants: Sequence[Mapping[str, float] | None] | None = None
@@ -104,13 +110,18 @@ class EstimateTrace:
         names = (*_COLUMNS, "settled")
         columns: dict[str, Any] = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
         constants = None if estimates[-1].constants is None else [estimate.constants for estimate in estimates]
-        reasons = np.array([estimate.reason for estimate in estimates], dtype=object)
-        return cls(np.array(time_s), **columns, reason=reasons, constants=constants)
+        findings = [estimate.findings for estimate in estimates]
+        return cls(np.array(time_s), **columns, findings=findings, constants=constants)
+
+    @property
+    def reason(self) -> StringArray | None:
+        """The findings of each as one text."""
+        return None if self.findings is None else np.array([reason_of(each) for each in self.findings], dtype=object)
 
 
 def last_estimate(trace: EstimateTrace) -> Estimate:
     """The last estimate of a trace that states uncertainties and what is settled."""
-    assert trace.reason is not None
+    assert trace.findings is not None
     constants = None if trace.constants is None else trace.constants[-1]
     columns: dict[str, Any] = {name: getattr(trace, name)[-1].item() for name in _COLUMNS}
-    return Estimate(**columns, reason=str(trace.reason[-1]), constants=constants)
+    return Estimate(**columns, findings=trace.findings[-1], constants=constants)

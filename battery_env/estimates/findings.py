@@ -1,17 +1,18 @@
 """
-Why an estimate is not settled: one table of reasons for least squares, the filter, policies and the closed form, in their
-order, and one of what leaves a charge or a resistance in doubt; and the limits that they name.
+Findings: why an estimate is not settled, as data. One table has the reasons of least squares, the filter, policies and the
+closed form, in their order, another one what leaves a charge or a resistance in doubt. All texts are made here.
 :mod:`battery_env.estimators.verdict` goes by them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from enum import IntEnum
-from itertools import permutations
 from typing import Any
 
-from battery_env.parameters import PARAMETER_NAMES
+from battery_env.parameters import Q_MOBILE
 
 #: An estimate is settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a real
 #: cell the error of the model divided by the current is a quarter of it already.
@@ -20,11 +21,12 @@ SETTLED_SHARES = {"q_mobile": 0.02, "r_o": 0.3}
 MOST_OF_SD = 0.5**0.5
 
 # What texts say of each number: its name, how much of it is in doubt, how well it has to be known, and what an estimate lacks.
+# A doubt has a size, under the name that stands in braces there.
 _OF_NUMBER: Mapping[str, Mapping[str, Any]] = {
     "q_mobile": {
         "name": "q_max",
-        "form": ".0f",
-        "unit": "C",
+        "size": "in_doubt_C",
+        "in_doubt": "{in_doubt_C:.0f} C are in doubt: ",
         "limit_percent": 100.0 * SETTLED_SHARES["q_mobile"],
         "lack": (
             "the voltage shows it at the knee, the steep end of the discharge, and the record does not go far enough into it. "
@@ -34,8 +36,8 @@ _OF_NUMBER: Mapping[str, Mapping[str, Any]] = {
     },
     "r_o": {
         "name": "R_o",
-        "form": ".3f",
-        "unit": "ohm of R_o",
+        "size": "in_doubt_ohm",
+        "in_doubt": "{in_doubt_ohm:.3f} ohm of R_o are in doubt: ",
         "limit_percent": 100.0 * SETTLED_SHARES["r_o"],
         "lack": (
             "the error expected of noise and model, divided by the current, is larger. Take a larger current, or state a "
@@ -43,6 +45,8 @@ _OF_NUMBER: Mapping[str, Mapping[str, Any]] = {
         ),
     },
 }
+# What texts say in words, by what was measured of it.
+_WORDS = {"expected": ("initial_soc",), "fitted": ("least_fitted_A", "most_fitted_A")}
 _IMPRECISE = "{name} is not known to {limit_percent:.0f} % yet: {lack}."
 
 
@@ -77,8 +81,8 @@ class Doubt(_Row):
     )
     DROPPED = "the current changes for a moment, and the voltage does not follow. Check the current sensor and its logger."
     SWITCHES = (
-        "the load is switched between two samples, nobody knows when, {switches} times. Log a sample before and after each "
-        "switch, a second apart, or the charge that the tester counts."
+        "the load is switched between two samples, nobody knows when, {switches:.0f} times. Log a sample before and after "
+        "each switch, a second apart, or the charge that the tester counts."
     )
     GAP = (
         "no sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not show that the load was "
@@ -127,11 +131,11 @@ class Reason(_Row):
     )
     # faults of the samples; a stream keeps the first one in time
     RECOVERED = (
-        "The voltage comes back to that of the start at {fault_s:.0f} s, though {size:.0f} C were drawn: the cell was charged."
-        " Reset the filter when a discharge begins."
+        "The voltage comes back to that of the start at {fault_s:.0f} s, though {drawn_C:.0f} C were drawn: the cell was "
+        "charged. Reset the filter when a discharge begins."
     )
-    NOT_FOLLOWED = "The current changes by {size:.2f} A at {fault_s:.0f} s, and the voltage does not follow."
-    RISES = "The voltage rises by {size:.2f} V at {fault_s:.0f} s, where the current stays as it was."
+    NOT_FOLLOWED = "The current changes by {change_A:.2f} A at {fault_s:.0f} s, and the voltage does not follow."
+    RISES = "The voltage rises by {rise_V:.2f} V at {fault_s:.0f} s, where the current stays as it was."
     MISSED = (
         "Between two samples under a steady load the voltage steps by what {missed_C:.0f} C make: rows are missing together "
         "with their time, or a charge is, that flowed and was not measured. Export all rows, with the clock of the tester."
@@ -160,7 +164,11 @@ class Reason(_Row):
     )
     PRIOR_WRONG = "The prior of {name} contradicts what the record says."
     # what the record does not tell of one number
-    IN_DOUBT = "{in_doubt:{form}} {unit} are in doubt: {doubt}"
+    IN_DOUBT = ""  # the text is that of the doubt
+    BELOW_ALL_SIZES = (
+        f"Cells below {min(Q_MOBILE.limits) / 3.6:.0f} mAh are not modelled, nor fitted: what was drawn is known, and no more."
+    )
+    OTHER = "{message}"  # of a record that cannot be used, or of an estimator of your own
     PRIOR_ALONE = "{name} rests on its prior: the record alone does not determine it yet. Without it " + _IMPRECISE
     PATH_UNTESTED = (
         "What the record tells of R_o rests on the path of aging cells, as long as q_max does not show that it fits. "
@@ -174,13 +182,70 @@ class Reason(_Row):
     # none of these
     SETTLED = ""
 
-    def said(self, number: str, measured: Mapping[str, Any]) -> str:
-        """The text against a number, filled with what was measured."""
-        return self.text.format_map({**measured, **_OF_NUMBER[number]})
+
+#: All that can be found, by its code.
+CODES: Mapping[str, Reason | Doubt] = {row.name.lower(): row for row in (*Reason, *Doubt) if row.text}
 
 
-def is_only_imprecise(reason: str) -> bool:
+@dataclass(frozen=True)
+class Finding:
+    """
+    What speaks against an estimate. ``str`` gives it as a text that says what to do.
+
+    :param code: what it is, of the table :data:`CODES`
+    :param number: the number that it is about, ``"q_mobile"`` or ``"r_o"``; empty: the record as a whole
+    :param measured: what was measured, by names with SI units
+    """
+
+    code: str
+    number: str = ""
+    measured: Mapping[str, float | str] = field(default_factory=dict, hash=False)
+
+    @classmethod
+    def of(cls, row: Reason | Doubt, number: str = "", size: float | None = None, **measured: Any) -> Finding:
+        """
+        A finding of some row, with that part of what was measured which its text names.
+
+        :param size: how much a doubt leaves open
+        """
+        named = [part for name in re.findall(r"{(\w+)", row.text) for part in _WORDS.get(name, (name,))]
+        sizes = {} if size is None else {_OF_NUMBER[number]["size"]: float(size)}
+        told = {name: value if isinstance(value, str) else float(value) for name, value in measured.items() if name in named}
+        return cls(row.name.lower(), number, sizes | told)
+
+    def __str__(self) -> str:
+        row, of_number = CODES[self.code], _OF_NUMBER.get(self.number, {})
+        text = of_number["in_doubt"] + row.text if isinstance(row, Doubt) else row.text
+        return text.format_map({**of_number, **_words(self.measured), **self.measured})
+
+
+def _words(measured: Mapping[str, Any]) -> dict[str, str]:
+    """What texts say in words."""
+    words = {}
+    if "initial_soc" in measured:
+        soc = measured["initial_soc"]
+        words["expected"] = "a full cell" if soc == 1.0 else f"a cell with {soc:.0%} of its charge"
+    if "least_fitted_A" in measured:
+        words["fitted"] = " to ".join(dict.fromkeys(f"{measured[name]:.3g}" for name in _WORDS["fitted"]))
+    return words
+
+
+def reason_of(findings: Iterable[Finding]) -> str:
+    """Findings as one text."""
+    return " ".join(map(str, findings))
+
+
+def codes_of(findings: Iterable[Finding]) -> str:
+    """The codes of findings, each with the number that it is about, as in ``misfit imprecise:r_o``."""
+    return " ".join(":".join(filter(None, (each.code, each.number))) for each in findings)
+
+
+def findings_of(rows: Iterable[Mapping[str, Any]]) -> tuple[Finding, ...]:
+    """Findings from what ``asdict`` made of them."""
+    return tuple(Finding(**row) for row in rows)
+
+
+def is_only_imprecise(findings: Iterable[Finding]) -> bool:
     """Return whether an estimate is not settled by its precision alone: nothing in the record contradicts it."""
-    rows = [row for row in Reason if Reason.PRIOR_ALONE <= row < Reason.SETTLED]
-    texts = {row.said(number, {}) for row in rows for number in PARAMETER_NAMES}
-    return reason in {*texts, *map(" ".join, permutations(texts, 2))}
+    rows = [CODES[each.code] for each in findings]
+    return bool(rows) and all(isinstance(row, Reason) and row >= Reason.PRIOR_ALONE for row in rows)
