@@ -50,9 +50,11 @@ COLOUR_OF: Mapping[str, str] = {
 #: Of the axes of parameters.
 LABELS = {name: parameter.label for name, parameter in PARAMETERS.items()}
 
-# Title of the axis of each panel of a life, in the units of a lab, with the scale to them.
+# Title of the axis of each panel of a life, in the units of a lab, with the scale to them. Of both resistances the one that
+# the table has.
 _LIFE_COLUMNS = {
     "q_mobile_C": (f"{Q_MOBILE.symbol} (Ah)", 1.0 / 3600.0),
+    "resistance_10s_ohm": (r"10 s resistance (m$\Omega$)", 1e3),
     "r_o_ohm": (rf"{R_O.symbol} (m$\Omega$)", 1e3),
     "drawn_Ah": ("charge drawn (Ah)", 1.0),
 }
@@ -246,22 +248,24 @@ def plot_cell_fit(fit: CellFit, discharges: Sequence[Record]) -> Figure:
 
 def plot_life(table: pd.DataFrame) -> Figure:
     """
-    What became of cells over their discharges: both parameters and the charge drawn, one line a cell, with bars of two
+    What became of cells over their discharges: q_max, the resistance and the charge drawn, one line a cell, with bars of two
     standard deviations to either side. Estimates that are not settled are hollow, and have none.
 
     Most of the error of an estimate is that of the model or of a sensor, which all discharges of a cell share: it shifts a
     line and does not bend it. What the discharges do not share shows in the scatter of the points.
 
-    :param table: a row a discharge with ``cycle``, ``q_mobile_C``, ``sd_q_mobile_C``, ``r_o_ohm``, ``sd_r_o_ohm``,
-        ``drawn_Ah`` and ``settled``, as the command line writes it, and if there are several cells with ``cell``. Where each
-        cell has one discharge in it, the rows are taken for the discharges of one cell. They are drawn over their cycles, or
-        over their order where the cycles are not known
+    :param table: a row a discharge with ``cycle``, ``q_mobile_C``, ``sd_q_mobile_C``, ``resistance_10s_ohm`` or ``r_o_ohm``,
+        its standard deviation, ``drawn_Ah`` and ``settled``, as the command line writes it, and if there are several cells
+        with ``cell``. Where each cell has one discharge in it, the rows are taken for the discharges of one cell. They are
+        drawn over their cycles, or over their order where the cycles are not known
     :raises ValueError: for estimates of more than one ``method``, whose ``r_o`` mean different things
     """
     if "method" in table and table["method"].nunique() > 1:
         raise ValueError(
             f"a life is drawn for one method, got {' and '.join(table['method'].unique())}: their r_o differ by up to a third"
         )
+    has_measurable = "resistance_10s_ohm" in table and table["resistance_10s_ohm"].notna().any()
+    left_out = "r_o_ohm" if has_measurable else "resistance_10s_ohm"
     figure = new_figure(6.8, 6.8)
     panels = figure.subplots(3, 1, sharex=True)
     one_each = "cell" not in table or not table["cell"].duplicated().any()
@@ -271,13 +275,14 @@ def plot_life(table: pd.DataFrame) -> Figure:
         number = of_cell["cycle"].astype(float) if is_numbered else np.arange(1.0, len(of_cell) + 1.0)
         rows = of_cell.set_index(number).sort_index()
         settled = rows["settled"].astype(bool)
-        for axes, (column, (label, scale)) in zip(panels, _LIFE_COLUMNS.items(), strict=True):
+        shown = [(column, *how) for column, how in _LIFE_COLUMNS.items() if column != left_out]
+        for axes, (column, label, scale) in zip(panels, shown, strict=True):
             values = scale * rows[column]
             reach = 2.0 * scale * rows[f"sd_{column}"][settled] if f"sd_{column}" in rows else None
             axes.plot(values, color=colour, lw=0.8, alpha=0.6)
             axes.plot(values[~settled], "o", ms=3.2, mfc="white", mec=colour, mew=0.8)
-            shown = values[settled]
-            axes.errorbar(shown.index, shown, reach, fmt="o", ms=2.6, color=colour, elinewidth=0.4, label=literal(str(name)))
+            known = values[settled]
+            axes.errorbar(known.index, known, reach, fmt="o", ms=2.6, color=colour, elinewidth=0.4, label=literal(str(name)))
             axes.set_ylabel(label)
     panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     panels[-1].set_xlabel("cycle" if is_numbered else "discharge")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import isnan, nan, sqrt
 from typing import Any
 
 import numpy as np
@@ -23,11 +23,16 @@ class Estimate:
     :param sd_q_mobile: its stated standard deviation, C; NaN if the calibrator states none
     :param sd_r_o: likewise, ohm
     :param settled: whether the data determine the estimate, and nothing in the record contradicts it: a fully charged cell
-        says nothing about ``q_mobile``, and a prior alone settles nothing. Both numbers are settled then
+        says nothing about ``q_mobile``, and a prior alone settles nothing. ``q_mobile`` and the resistance are settled then:
+        that after ten seconds, or where none is stated ``r_o``
     :param findings: why it is not settled, the largest doubt first; empty if it is
     :param settled_q_mobile: whether ``q_mobile`` is settled, though ``r_o`` may not be; where ``settled`` is false and nothing
         is said of either number, neither is
     :param settled_r_o: likewise
+    :param resistance_10s_ohm: what a meter shows of the cell: the fall of the voltage of the fitted model from rest to ten
+        seconds after load-on, over the current, at the charge, current and temperature of this record; NaN if it has no rest
+    :param sd_resistance_10s_ohm: its stated standard deviation, ohm
+    :param settled_resistance_10s: whether it is settled; false where it is not stated
     :param constants: what else was found of the cell, by the names of an :class:`~battery_env.AgingPath`; ``None``: nothing
     """
 
@@ -39,14 +44,18 @@ class Estimate:
     findings: tuple[Finding, ...] = ()
     settled_q_mobile: bool = True
     settled_r_o: bool = True
+    resistance_10s_ohm: float = nan
+    sd_resistance_10s_ohm: float = nan
+    settled_resistance_10s: bool = False
     constants: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
-        if not (self.settled_q_mobile and self.settled_r_o):
+        is_settled = self.settled_r_o if isnan(self.resistance_10s_ohm) else self.settled_resistance_10s
+        if not (self.settled_q_mobile and is_settled):
             object.__setattr__(self, "settled", False)
         elif not self.settled:
-            object.__setattr__(self, "settled_q_mobile", False)
-            object.__setattr__(self, "settled_r_o", False)
+            for name in ("settled_q_mobile", "settled_r_o", "settled_resistance_10s"):
+                object.__setattr__(self, name, False)
 
     @property
     def reason(self) -> str:
@@ -72,7 +81,10 @@ class Estimate:
         return replace(self, q_mobile=q_mobile, sd_q_mobile=q_mobile * share * sqrt(max(variance, 0.0)))
 
 
-_COLUMNS = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled_q_mobile", "settled_r_o")
+_COLUMNS = (
+    *("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "settled_q_mobile", "settled_r_o"),
+    *("resistance_10s_ohm", "sd_resistance_10s_ohm", "settled_resistance_10s"),
+)
 
 
 @dataclass(frozen=True)
@@ -90,6 +102,9 @@ class EstimateTrace:
     :param findings: why each is not, empty for those that are
     :param settled_q_mobile: whether it takes each ``q_mobile`` for settled
     :param settled_r_o: likewise
+    :param resistance_10s_ohm: as of :class:`Estimate`
+    :param sd_resistance_10s_ohm: likewise
+    :param settled_resistance_10s: likewise
     :param constants: what else was found with each, as of :class:`Estimate`
     """
 
@@ -102,6 +117,9 @@ class EstimateTrace:
     findings: Sequence[tuple[Finding, ...]] | None = None
     settled_q_mobile: BoolArray | None = None
     settled_r_o: BoolArray | None = None
+    resistance_10s_ohm: FloatArray | None = None
+    sd_resistance_10s_ohm: FloatArray | None = None
+    settled_resistance_10s: BoolArray | None = None
     constants: Sequence[Mapping[str, float] | None] | None = None
 
     @classmethod
@@ -123,5 +141,5 @@ def last_estimate(trace: EstimateTrace) -> Estimate:
     """The last estimate of a trace that states uncertainties and what is settled."""
     assert trace.findings is not None
     constants = None if trace.constants is None else trace.constants[-1]
-    columns: dict[str, Any] = {name: getattr(trace, name)[-1].item() for name in _COLUMNS}
+    columns: dict[str, Any] = {name: each[-1].item() for name in _COLUMNS if (each := getattr(trace, name)) is not None}
     return Estimate(**columns, findings=trace.findings[-1], constants=constants)

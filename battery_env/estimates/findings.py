@@ -16,10 +16,14 @@ from battery_env.parameters import Q_MOBILE
 
 #: An estimate is settled when its standard deviation is below this share of its value. That of ``r_o`` is wider: on a real
 #: cell the error of the model divided by the current is a quarter of it already.
-SETTLED_SHARES = {"q_mobile": 0.02, "r_o": 0.3}
+SETTLED_SHARES = {"q_mobile": 0.02, "r_o": 0.3, "resistance_10s": 0.3}
 #: What makes most of a variance is the reason for it.
 MOST_OF_SD = 0.5**0.5
 
+_LACK_OF_CURRENT = (
+    "the error expected of noise and model, divided by the current, is larger. Take a larger current, or state a smaller "
+    "mismatch_V if the model is that good"
+)
 # What texts say of each number: its name, how much of it is in doubt, how well it has to be known, and what an estimate lacks.
 # A doubt has a size, under the name that stands in braces there.
 _OF_NUMBER: Mapping[str, Mapping[str, Any]] = {
@@ -39,10 +43,14 @@ _OF_NUMBER: Mapping[str, Mapping[str, Any]] = {
         "size": "in_doubt_ohm",
         "in_doubt": "{in_doubt_ohm:.3f} ohm of R_o are in doubt: ",
         "limit_percent": 100.0 * SETTLED_SHARES["r_o"],
-        "lack": (
-            "the error expected of noise and model, divided by the current, is larger. Take a larger current, or state a "
-            "smaller mismatch_V if the model is that good"
-        ),
+        "lack": _LACK_OF_CURRENT,
+    },
+    "resistance_10s": {
+        "name": "The resistance after ten seconds",
+        "size": "in_doubt_ohm",
+        "in_doubt": "{in_doubt_ohm:.3f} ohm of the resistance after ten seconds are in doubt: ",
+        "limit_percent": 100.0 * SETTLED_SHARES["resistance_10s"],
+        "lack": _LACK_OF_CURRENT,
     },
 }
 # What texts say in words, by what was measured of it.
@@ -163,6 +171,11 @@ class Reason(_Row):
         "this is one discharge."
     )
     PRIOR_WRONG = "The prior of {name} contradicts what the record says."
+    RESISTANCE_DIFFERS = (
+        "{after_s:.0f} s after the load was switched on, at {step_s:.0f} s, the resistance is {measured_ohm:.3f} ohm as "
+        "measured and {model_ohm:.3f} ohm by the fit of the whole record, {apart_sd:.1f} standard deviations apart: current "
+        "and voltage are not of the same moments, as if a sensor lags or averages. Check both sensors and their logger."
+    )
     # what the record does not tell of one number
     IN_DOUBT = ""  # the text is that of the doubt
     BELOW_ALL_SIZES = (
@@ -193,7 +206,7 @@ class Finding:
     What speaks against an estimate. ``str`` gives it as a text that says what to do.
 
     :param code: what it is, of the table :data:`CODES`
-    :param number: the number that it is about, ``"q_mobile"`` or ``"r_o"``; empty: the record as a whole
+    :param number: the number that it is about, ``"q_mobile"``, ``"r_o"`` or ``"resistance_10s"``; empty: the record as a whole
     :param measured: what was measured, by names with SI units
     """
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot, nan, sqrt
-from typing import Any
+from math import hypot, isnan, nan, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,7 @@ from battery_env.estimators.diagnosis.knee import knee_sd_C
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
+from battery_env.estimators.resistance import PULSE_S, ModelResistance, later_step, load_on
 from battery_env.estimators.search import (
     MARGIN,
     AnyPrior,
@@ -37,6 +38,7 @@ from battery_env.estimators.search import (
 )
 from battery_env.estimators.verdict import (
     PRIOR_LIMIT_SD,
+    RESISTANCE_LIMIT_SD,
     SPARE_SAMPLES,
     Assumptions,
     Diagnosis,
@@ -46,7 +48,16 @@ from battery_env.estimators.verdict import (
     white_noise_V,
 )
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O, check_parameters
-from battery_env.records import ChargeHistory, DischargeStart, Record, Samples, check_record, drawn_charge_C, history_of
+from battery_env.records import (
+    STEADY_S,
+    ChargeHistory,
+    DischargeStart,
+    Record,
+    Samples,
+    check_record,
+    drawn_charge_C,
+    history_of,
+)
 from battery_env.records.model import RecordModel
 
 # Noise told from residuals is not below the resolution of a voltmeter, V.
@@ -76,6 +87,14 @@ class _Fitted:
             knee_sd_C = fit.knee_sd_C if name == "q_mobile" else 0.0
             sd[name] = hypot(ratio * sqrt(self.variance) * float(root), self.hidden_sd[name], knee_sd_C)
         return sd
+
+
+class _Resistance(NamedTuple):
+    """The resistance after ten seconds, its standard deviation, and what of that is by the moment of load-on, ohm."""
+
+    ohm: float = nan
+    sd_ohm: float = nan
+    load_on_ohm: float = 0.0
 
 
 class LeastSquares(Estimator):
@@ -248,9 +267,19 @@ class LeastSquares(Estimator):
             starts = search.starts([self.model.cell.q_mobile])[0]
         fitted = self._fitted(record, search, starts, history)
         sd = fitted.sd(fitted.fit, dict.fromkeys(self.parameters, self._sd_ratio))
+        resistance = self._resistance(record, history, fitted, fitted.fit)
         values, verdict = fitted.fit.values, self._verdict(record, history, fitted)
         constants = {name: values[name] for name in self.nuisance if name != "offset_V"} or None
-        return Estimate(values["q_mobile"], values["r_o"], sd["q_mobile"], sd["r_o"], **verdict._asdict(), constants=constants)
+        return Estimate(
+            q_mobile=values["q_mobile"],
+            r_o=values["r_o"],
+            sd_q_mobile=sd["q_mobile"],
+            sd_r_o=sd["r_o"],
+            resistance_10s_ohm=resistance.ohm,
+            sd_resistance_10s_ohm=resistance.sd_ohm,
+            **verdict._asdict(),
+            constants=constants,
+        )
 
     def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]], history: ChargeHistory) -> _Fitted:
         """The best fits with and without the prior, and what their standard deviations are made of."""
@@ -340,6 +369,35 @@ class LeastSquares(Estimator):
             for n, name in enumerate(self.parameters)
         }
 
+    def _resistance(self, record: Samples, history: ChargeHistory, fitted: _Fitted, fit: Fit) -> _Resistance:
+        """The resistance after ten seconds of a fit; NaN where the record does not begin with a rest and a load that stays."""
+        step = load_on(record, history.at_rest) if self._at_rest and self.parameters == PARAMETER_NAMES else None
+        if step is None or not step.stays:
+            return _Resistance()
+        found = ModelResistance.of(record, step, fitted.search, fit)
+        load_on_ohm = found.per_s * history.load_on_C / step.size_A
+        fit_ohm = self._sd_ratio * sqrt(fitted.variance) * found.sd_ohm
+        return _Resistance(found.ohm, hypot(fit_ohm, load_on_ohm, self.current_gain_sd * found.ohm), load_on_ohm)
+
+    def _differing(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> dict[str, float]:
+        """What was measured of a load whose voltage falls otherwise than that of the model; nothing where both agree."""
+        # constants that are held, and may be wrong, explain a difference as well
+        is_open = self.parameters == PARAMETER_NAMES and any(name in self.nuisance for name in RATE_CONSTANTS)
+        step = (load_on(record, history.at_rest) or later_step(record)) if is_open else None
+        model_V, root = _model_V(record, fitted.alone), self._sd_ratio * sqrt(fitted.variance)
+        for after_s in (PULSE_S, STEADY_S):  # what lags by less than these shows at one of them
+            if step is None or not step.is_seen(record, after_s):
+                continue
+            measured_ohm = step.fall_ohm(record, record.time_s, record.voltage_V, after_s)
+            model_ohm = step.fall_ohm(record, record.time_s, model_V, after_s)
+            sd_ohm = root * ModelResistance.of(record, step, fitted.search, fitted.alone, after_s).sd_ohm
+            noise_ohm = MOST_NOISE_SD * root * fitted.search.error.noise_V / step.size_A
+            apart_ohm = abs(measured_ohm - model_ohm)
+            if apart_ohm > hypot(RESISTANCE_LIMIT_SD * sd_ohm, noise_ohm):
+                found = {"after_s": after_s, "step_s": step.on_s, "measured_ohm": measured_ohm, "model_ohm": model_ohm}
+                return {**found, "apart_sd": apart_ohm / sd_ohm}
+        return {}
+
     def _verdict(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> Verdict:
         """What speaks against an estimate."""
         fit, alone, evidence, (soc, sd_soc) = fitted.fit, fitted.alone, fitted.evidence, self.initial_soc
@@ -358,14 +416,26 @@ class LeastSquares(Estimator):
             diagnosis.note(Reason.OTHER_KIND, ratio > 1.0, what="distance from the path of aging cells", ratio=ratio)
         moved = fit.square - alone.square
         diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance)
+        differing = self._differing(record, history, fitted)
+        diagnosis.note(Reason.RESISTANCE_DIFFERS, bool(differing), **differing)
         for name in fit.at_bound:
             diagnosis.note_about(name, Reason.AT_BOUND)
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
-        known = Assumptions(self.current_gain_sd, sd_soc / soc, knee_sd_C=alone.knee_sd_C, is_along_path=self.path is not None)
+        resistance = self._resistance(record, history, fitted, alone)
+        known = Assumptions(
+            self.current_gain_sd,
+            sd_soc / soc,
+            knee_sd_C=alone.knee_sd_C,
+            load_on_ohm=resistance.load_on_ohm,
+            is_along_path=self.path is not None,
+        )
         # where the record has it and where a prior has moved it: beside its knee the voltage says little of q_mobile
         moved_there = replace(alone, jacobian=np.vstack([fit.jacobian[:n], alone.jacobian[n:]]))
         own_sds = [fitted.sd(each, {"q_mobile": self._sd_ratio}) for each in (alone, moved_there)]
-        return diagnosis.verdict(alone.values, {name: max(sd[name] for sd in own_sds) for name in free}, free, priors, known)
+        sds = {name: max(sd[name] for sd in own_sds) for name in free}
+        if not isnan(resistance.ohm):
+            sds["resistance_10s"] = resistance.sd_ohm
+        return diagnosis.verdict(alone.values | {"resistance_10s": resistance.ohm}, sds, list(sds), priors, known)
 
 
 def _model_V(record: Samples, fit: Fit) -> FloatArray:

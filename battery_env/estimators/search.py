@@ -408,6 +408,11 @@ class Search:
 
     def residual(self, values: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
         """Return the residuals at the samples, V, and their derivatives by all unknowns."""
+        model_V, *columns = self.data.at_samples(self.voltage(values))
+        return model_V - self.data.voltage_V, np.column_stack(columns)
+
+    def voltage(self, values: Mapping[str, float]) -> list[FloatArray]:
+        """Return the voltage of the model on its grid of time, V, and its derivatives by all unknowns."""
         q_mobile, r_o = values["q_mobile"], values["r_o"]
         if self.nuisance:
             model_V, slopes, fraction_p = self.model_at(values).tangents(self.data.current_A, q_mobile, r_o)
@@ -418,8 +423,7 @@ class Search:
         else:
             model_V, *both = self.model.sensitivities(self.data.current_A, q_mobile, r_o)
             by_name = dict(zip(PARAMETER_NAMES, both, strict=True))
-        seen_V, *columns = self.data.at_samples([model_V, *(by_name[name] for name in self.unknown)])
-        return seen_V - self.data.voltage_V, np.column_stack(columns)
+        return [model_V, *(by_name[name] for name in self.unknown)]
 
     def model_at(self, values: Mapping[str, float]) -> RecordModel:
         """Return the model with the nuisance constants at some values."""
@@ -485,6 +489,14 @@ def root_inverse_diagonal(jacobian: FloatArray) -> FloatArray:
         return np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     except np.linalg.LinAlgError:
         return np.full(jacobian.shape[1], np.inf)
+
+
+def root_variance(jacobian: FloatArray, row: FloatArray) -> float:
+    """The root of row (J^T J)^-1 row^T, the variance of a linear function of the parameters; infinite as above."""
+    try:
+        return sqrt(max(float(row @ np.linalg.inv(jacobian.T @ jacobian) @ row), 0.0))
+    except np.linalg.LinAlgError:
+        return inf
 
 
 def _within(value: float, limits: tuple[float, float]) -> float:

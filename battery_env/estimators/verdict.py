@@ -34,20 +34,26 @@ SPARE_SAMPLES = 10
 #: A prior contradicts the record beyond so many standard deviations of their difference. Within it, a prior of the settled
 #: width moves no estimate by more than 5 %.
 PRIOR_LIMIT_SD = 2.5
+#: The resistance of the model contradicts the measured one beyond so many standard deviations: on sound records
+#: of the bundled cells both agree within 0.9.
+RESISTANCE_LIMIT_SD = 2.0
 # Residuals whose variance is so many of its standard deviations above the one expected are not noise; and where the noise is
 # told from the residuals themselves, by so large a share over the root of their number.
 _EXCESS_LIMIT, _EXCESS_LIMIT_UNSTATED = 5.0, 10.0
 
-_SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"])
-#: An estimate and its verdict; pairs are of ``q_mobile`` (C) and ``r_o`` (ohm): the values, their standard deviations with all
+#: What is judged: both parameters, and the resistance after ten seconds, ohm.
+NUMBERS = (*PARAMETER_NAMES, "resistance_10s")
+_SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"], SETTLED_SHARES["resistance_10s"])
+#: An estimate and its verdict; what is threefold is of ``NUMBERS``: the values, their standard deviations with all
 #: that is known and by the record alone, whether they are searched for and whether they have a prior; the first reason against
-#: each, which of both it names, and of one that is in doubt by what and how much; and whether ``r_o`` is in the larger doubt.
+#: each, which number it names, and of one that is in doubt by what and how much; and whether the resistance is in the larger
+#: doubt.
 JUDGED = table(
     [
-        *((name, "f8", 2) for name in ("value", "sd", "own_sd")),
-        *((name, "i8", 2) for name in ("is_searched", "has_prior", "reason")),
-        *(("about", "i8", 2), ("doubt", "i8", 2), ("in_doubt", "f8", 2)),
-        ("r_o_comes_first", "b1"),
+        *((name, "f8", 3) for name in ("value", "sd", "own_sd")),
+        *((name, "i8", 3) for name in ("is_searched", "has_prior", "reason")),
+        *(("about", "i8", 3), ("doubt", "i8", 3), ("in_doubt", "f8", 3)),
+        ("resistance_comes_first", "b1"),
     ]
 )
 
@@ -60,6 +66,7 @@ class Assumptions(NamedTuple):
     cell_sd_r_o: float = 0.0  # what the constants of the cell leave open of ``r_o``, ohm
     knee_sd_C: float = 0.0  # of the charge beyond the knee of the model
     apart: tuple[float, float] = (0.0, 0.0)  # how far a policy is from the fit in its observation, C and ohm
+    load_on_ohm: float = 0.0  # of the resistance after ten seconds, by the moment of load-on
     is_along_path: bool = False  # whether these constants lie along a path of aging cells
 
 
@@ -73,15 +80,15 @@ def _note_one(judged: Row, k: int, reason: int, about: int, holds: bool) -> None
 
 @compiled
 def note(judged: Row, reason: int, holds: bool) -> None:
-    """Note a reason against both numbers, if it holds, that names none of them."""
+    """Note a reason against all numbers, if it holds, that names none of them."""
     note_about(judged, -1, reason, holds)
 
 
 @compiled
 def note_about(judged: Row, about: int, reason: int, holds: bool) -> None:
-    """Note one that names one number, against both, if it holds."""
-    _note_one(judged, 0, reason, about, holds)
-    _note_one(judged, 1, reason, about, holds)
+    """Note one that names one number, against all, if it holds."""
+    for k in range(len(judged.reason)):
+        _note_one(judged, k, reason, about, holds)
 
 
 @compiled
@@ -98,54 +105,61 @@ def judge(judged: Row, evidence: Row, known: Assumptions) -> None:
     start, fault = start_reason(evidence), fault_reason(evidence)
     note(judged, start, start > 0)
     note(judged, fault, fault > 0)
-    beyond_q = beyond_r_o = 0.0  # in standard deviations that a settled one may have
-    for k in range(2):
+    beyond_q = beyond_r = 0.0  # in standard deviations that a settled one may have
+    for k in range(len(judged.reason)):
         if judged.is_searched[k] == 0:
             continue
-        sd, own_sd, most_sd, is_r_o = judged.sd[k], judged.own_sd[k], _SHARES[k] * judged.value[k], k == 1
+        sd, own_sd, most_sd, is_r = judged.sd[k], judged.own_sd[k], _SHARES[k] * judged.value[k], k > 0
         _note_one(judged, k, Reason.PRIOR_ALONE, k, judged.has_prior[k] > 0 and not own_sd < most_sd)
         if not sd < most_sd:
-            note(judged, Reason.MISSED, not is_r_o and evidence.missed_C > MOST_OF_SD * sd)
-            if is_r_o:
-                _note_doubt(judged, 1, Doubt.DROPPED, evidence.dropped_ohm)
-                _note_doubt(judged, 1, Doubt.CONSTANTS, known.cell_sd_r_o)
+            note(judged, Reason.MISSED, not is_r and evidence.missed_C > MOST_OF_SD * sd)
+            if is_r:
+                _note_doubt(judged, k, Doubt.DROPPED, evidence.dropped_ohm)
+                _note_doubt(judged, k, Doubt.CONSTANTS, known.cell_sd_r_o)
+                _note_doubt(judged, k, Doubt.LOAD_ON, known.load_on_ohm if k > 1 else 0.0)
             else:
                 for number, size_C in enumerate(charges_in_doubt_C(evidence)):
                     _note_doubt(judged, 0, number + 1, size_C)
                 _note_doubt(judged, 0, Doubt.KNEE, known.knee_sd_C)
-            _note_doubt(judged, k, Doubt.POLICY, known.apart[k])
-            _note_one(judged, 1, Reason.PATH_UNTESTED, 1, not is_r_o and known.is_along_path)
-            scale_sd = known.gain_sd if is_r_o else hypot(known.gain_sd, known.sd_soc)
+                _note_one(judged, 1, Reason.PATH_UNTESTED, 1, known.is_along_path)
+                _note_one(judged, 2, Reason.PATH_UNTESTED, 2, known.is_along_path)
+            _note_doubt(judged, k, Doubt.POLICY, known.apart[k] if k < 2 else 0.0)
+            scale_sd = known.gain_sd if is_r else hypot(known.gain_sd, known.sd_soc)
             _note_one(judged, k, Reason.SCALE_UNKNOWN, k, scale_sd >= _SHARES[k])
             _note_one(judged, k, Reason.IMPRECISE, k, True)
-        if is_r_o:
-            _note_doubt(judged, 1, Doubt.SWITCHES, judged.value[1] if is_smeared(evidence) else 0.0)  # all of it
-            beyond_r_o = max(sd, own_sd) / most_sd
+        if is_r:
+            _note_doubt(judged, k, Doubt.SWITCHES, judged.value[k] if is_smeared(evidence) else 0.0)  # all of it
+            beyond_r = max(sd, own_sd) / most_sd
         else:
             beyond_q = max(sd, own_sd) / most_sd
-    judged.r_o_comes_first = beyond_r_o > beyond_q
+    judged.resistance_comes_first = beyond_r > beyond_q
 
 
 class Verdict(NamedTuple):
-    """Which numbers of an estimate are settled, and why not both, by the names of :class:`~battery_env.Estimate`."""
+    """Which numbers of an estimate are settled, and why not all, by the names of :class:`~battery_env.Estimate`."""
 
     settled_q_mobile: bool
     settled_r_o: bool
     findings: tuple[Finding, ...]
+    settled_resistance_10s: bool
 
     @classmethod
     def of(cls, judged: Any, measured: Mapping[str, Any]) -> Verdict:
         """What follows from a row of ``JUDGED``, with what was measured."""
         found = []
         for k, about in enumerate(judged["about"].tolist()):
-            reason, name = Reason(judged["reason"][k]), "" if about < 0 else PARAMETER_NAMES[about]
+            reason, name = Reason(judged["reason"][k]), "" if about < 0 else NUMBERS[about]
             if reason is Reason.IN_DOUBT:
                 found.append(Finding.of(Doubt(judged["doubt"][k]), name, judged["in_doubt"][k], **measured))
             else:
                 found.append(Finding.of(reason, name, **measured))
-        settled_q_mobile, settled_r_o = (each.code not in CODES for each in found)
-        in_order = dict.fromkeys(reversed(found) if judged["r_o_comes_first"] else found)
-        return cls(settled_q_mobile, settled_r_o, tuple(each for each in in_order if each.code in CODES))
+        settled_q_mobile, settled_r_o, settled_10s = (each.code not in CODES for each in found)
+        is_stated = bool(judged["is_searched"][2])
+        # where there is a resistance that a meter shows, that of the model need not be settled
+        of_both = [found[0], found[2 if is_stated else 1]]
+        in_order = dict.fromkeys(reversed(of_both) if judged["resistance_comes_first"] else of_both)
+        against = tuple(each for each in in_order if each.code in CODES)
+        return cls(settled_q_mobile, settled_r_o, against, settled_10s and is_stated)
 
 
 class Diagnosis:
@@ -163,14 +177,14 @@ class Diagnosis:
         self._judged["reason"] = Reason.SETTLED
 
     def note(self, reason: Reason, holds: bool = True, /, **measured: Any) -> None:
-        """Note that a reason holds against both numbers, if it does, with what was measured of it."""
+        """Note that a reason holds against all numbers, if it does, with what was measured of it."""
         if holds:
             note(self._judged, reason, True)
             self._measured = measured | self._measured
 
     def note_about(self, number: str, reason: Reason, holds: bool = True) -> None:
         """The same of one that names one number."""
-        note_about(self._judged, PARAMETER_NAMES.index(number), reason, holds)
+        note_about(self._judged, NUMBERS.index(number), reason, holds)
 
     def verdict(
         self,
@@ -185,10 +199,10 @@ class Diagnosis:
         searched for, and why not both: first why not the one that is farther beyond its limit.
         """
         judged = self._judged
-        judged["value"] = [values[name] for name in PARAMETER_NAMES]
-        judged["sd"] = judged["own_sd"] = [sds.get(name, nan) for name in PARAMETER_NAMES]
-        judged["is_searched"] = [name in searched for name in PARAMETER_NAMES]
-        judged["has_prior"] = [name in priors for name in PARAMETER_NAMES]
+        judged["value"] = [values.get(name, nan) for name in NUMBERS]
+        judged["sd"] = judged["own_sd"] = [sds.get(name, nan) for name in NUMBERS]
+        judged["is_searched"] = [name in searched for name in NUMBERS]
+        judged["has_prior"] = [name in priors for name in NUMBERS]
         judge(judged, self._evidence, known or Assumptions())
         return Verdict.of(judged, self._measured)
 

@@ -59,7 +59,8 @@ VERSION = resources.files("battery_env").joinpath("version.txt").read_text(encod
 
 _FORMAT = "battery_env.run"
 # Discharges that could not be used have no values there.
-_TYPES = {"cycle": "Int64", "settled": "boolean", "settled_q_mobile": "boolean", "settled_r_o": "boolean"}
+_SETTLED = ("settled", "settled_q_mobile", "settled_resistance_10s", "settled_r_o")
+_TYPES = {"cycle": "Int64", **dict.fromkeys(_SETTLED, "boolean")}
 # Warnings belong to the process: threads that catch them take turns.
 _CATCHING = threading.RLock()
 

@@ -26,6 +26,7 @@ from battery_env.estimates.findings import Reason
 from battery_env.estimators.diagnosis.evidence import evidence_of, fault_reason, start_reason
 from battery_env.estimators.diagnosis.gaps import doubtful_C
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
+from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.forecast import Forecast, forecast
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import each_usable, read_recordings
@@ -162,10 +163,14 @@ def calibrated(
         method=method,
         q_mobile_C=sized.q_mobile,
         sd_q_mobile_C=sized.sd_q_mobile,
+        resistance_10s_ohm=sized.resistance_10s_ohm,
+        sd_resistance_10s_ohm=sized.sd_resistance_10s_ohm,
+        measured_resistance_10s_ohm=measured_resistance_ohm(part.loaded, part.loaded.starts_at_rest),
         r_o_ohm=sized.r_o,
         sd_r_o_ohm=sized.sd_r_o,
         settled=sized.settled,
         settled_q_mobile=sized.settled_q_mobile,
+        settled_resistance_10s=sized.settled_resistance_10s,
         settled_r_o=sized.settled_r_o,
         findings=sized.findings,
         initial_soc=part.start.soc,
@@ -253,7 +258,8 @@ def _of_its_size(estimate: Estimate, settings: Settings, drawn_C: float) -> Esti
     near = 1.0 - _AT_BOUND
     if low_C < near * estimate.q_mobile < near**2 * high_C:
         return estimate
-    nothing: dict[str, Any] = dict.fromkeys(("q_mobile", "r_o", "sd_q_mobile", "sd_r_o"), float("nan"))
+    numbers = ("q_mobile", "r_o", "sd_q_mobile", "sd_r_o", "resistance_10s_ohm", "sd_resistance_10s_ohm")
+    nothing: dict[str, Any] = dict.fromkeys(numbers, float("nan"))
     findings = (Finding.of(Reason.BELOW_ALL_SIZES),) if drawn_C < _SMALLEST.q_mobile else estimate.findings
     return replace(estimate, **nothing, findings=findings)
 

@@ -86,7 +86,7 @@ def _drawn(text: str) -> tuple[list[float], list[float], str]:
 
 # What help begins with, before all options.
 _FIRST = """\
-q_max (the charge that can move), R_o (the resistance), health and the end of discharges, each from a full cell at rest.
+q_max (the charge that can move), resistance, health and the end of discharges, each from a full cell at rest.
 
 other commands, each with --help:
 {}
@@ -478,7 +478,7 @@ def _page(arguments: Sequence[str]) -> int:
     """The command ``page``: a page of this machine alone in a browser, until Ctrl-C."""
     parser = argparse.ArgumentParser(
         prog=f"{_NAME} page",
-        description="Open a page in the browser: drop files, see q_max, R_o, health and the life, forecast the end.",
+        description="Open a page in the browser: drop files, see q_max, resistance, health and the life, forecast the end.",
         epilog="Needs the extra page: pip install './battery_env[page]'. Nothing leaves this machine, or stays on its disk.",
         allow_abbrev=False,
     )

@@ -47,7 +47,8 @@ class Forecast:
     :param eod_time_s: end of discharge, on the clock of the record, s, shape (n,); infinite where it is not reached
     :param soc: state of charge at the end of the record: the share of ``q_mobile`` left in the negative electrode, shape (n,)
     :param q_mobile: charge that can move, C, shape (n,)
-    :param r_o: ohmic resistance, ohm, shape (n,)
+    :param resistance_10s_ohm: the resistance after ten seconds, as of the estimate, ohm, shape (n,); NaN if it states none
+    :param r_o: ohmic resistance of the model, ohm, shape (n,)
     :param capacity_Ah: charge given from full to the end of discharge, which is the capacity at this load, Ah, shape (n,).
         Where the record starts partly charged (``initial_soc`` of the model), what was missing then is added; NaN where the
         end is not reached
@@ -64,6 +65,7 @@ class Forecast:
     eod_time_s: FloatArray
     soc: FloatArray
     q_mobile: FloatArray
+    resistance_10s_ohm: FloatArray
     r_o: FloatArray
     capacity_Ah: FloatArray
     nominal_Ah: float
@@ -97,13 +99,15 @@ class Forecast:
 
     def summary(self) -> str:
         """The forecast in a readable form."""
-        q_max_Ah, r_o_mohm = self.q_mobile / 3600.0, 1e3 * self.r_o
+        q_max_Ah, is_measurable = self.q_mobile / 3600.0, bool(np.isfinite(self.resistance_10s_ohm).all())
+        resistance_mohm = 1e3 * (self.resistance_10s_ohm if is_measurable else self.r_o)
+        resistance_name = "10 s resistance (mohm)" if is_measurable else "R_o (mohm)"
         rows = {
             "end of discharge (s)": (self.eod_time_s, 0),
             "remaining time (s)": (self.remaining_s, 0),
             "state of charge now (%)": (100.0 * self.soc, 1),
             "q_max (Ah)": (q_max_Ah, decimals(float(np.median(q_max_Ah)), 3)),
-            "R_o (mohm)": (r_o_mohm, decimals(float(np.median(r_o_mohm)), 1)),
+            resistance_name: (resistance_mohm, decimals(float(np.median(resistance_mohm)), 1)),
             "capacity (Ah)": (self.capacity_Ah, decimals(float(np.median(self.capacity_Ah)), 3)),
         }
         if not np.isnan(self.nominal_Ah):
@@ -246,6 +250,7 @@ def forecast(
         eod_time_s=now_s + ends.time_s,
         soc=cells.soc,
         q_mobile=cells.q_mobile,
+        resistance_10s_ohm=_resistance_10s_ohm(estimate, r_ohm),
         r_o=r_ohm,
         capacity_Ah=ends.capacity_Ah,
         nominal_Ah=float(nominal_Ah),
@@ -359,6 +364,13 @@ def _draw_parameters(
     draws, middle_ohm = rng.standard_normal(samples), r_ohm + slope_ohm * deviation
     r_o, acting_ohm = (np.clip(middle_ohm + each_ohm * draws, *R_O.limits) for each_ohm in (own_ohm, whole_ohm))
     return q_C * np.exp(share * deviation), r_o, acting_ohm
+
+
+def _resistance_10s_ohm(estimate: Estimate, r_ohm: FloatArray) -> FloatArray:
+    """The resistance after ten seconds of cells with some ``r_o``, which makes up most of it: as far off as that is."""
+    is_known = estimate.sd_r_o > 0.0
+    off_sd = (r_ohm - estimate.r_o) / estimate.sd_r_o if is_known else np.zeros_like(r_ohm)
+    return np.asarray(estimate.resistance_10s_ohm + np.nan_to_num(estimate.sd_resistance_10s_ohm) * off_sd)
 
 
 def _at_the_end_of(

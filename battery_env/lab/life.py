@@ -25,6 +25,7 @@ from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome
 from battery_env.records import VARIED_SHARE, DischargeStart, drawn, drawn_charge_C, mean_current_A
@@ -33,9 +34,10 @@ from battery_env.records.discharge import Discharge
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
-_COLUMNS = (
-    "cycle q_mobile_C sd_q_mobile_C r_o_ohm settled findings reason valid capacity_Ah mean_current_A lasted_share".split()
-)
+_COLUMNS = """
+    cycle q_mobile_C sd_q_mobile_C resistance_10s_ohm sd_resistance_10s_ohm settled_resistance_10s measured_resistance_10s_ohm
+    r_o_ohm settled findings reason valid capacity_Ah mean_current_A lasted_share
+""".split()
 # Lives that are simulated, and discharges to look ahead.
 _LIVES, _MOST = 2000, 2000
 
@@ -49,10 +51,11 @@ class Life:
     their numbers leave discharges out, the walk goes on through these.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
-        ``r_o_ohm``, ``settled``, ``findings``, ``reason``, ``valid`` (whether it counts), ``capacity_Ah`` (charge to the
-        cut-off), ``mean_current_A``, ``lasted_share`` (its duration, as a share of the model's at this ``q_mobile``; NaN if it
-        was cut short), and what the discharges before let expect of ``q_mobile``, ``expected_q_mobile_C`` and
-        ``expected_sd_C`` (NaN for the first)
+        ``resistance_10s_ohm`` and ``sd_resistance_10s_ohm`` (after ten seconds, of a fit with constants that are not held),
+        ``settled_resistance_10s``, ``measured_resistance_10s_ohm``, ``r_o_ohm``, ``settled``, ``findings``, ``reason``,
+        ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off), ``mean_current_A``, ``lasted_share`` (its
+        duration, as a share of the model's at this ``q_mobile``; NaN if it was cut short), and what the discharges before let
+        expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of an estimate beside the others, likewise
     :param drift_share: mean step
@@ -232,10 +235,19 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
     for position, discharge in enumerate(discharges):
         row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
         try:
-            rows.append(row | _row_of(discharge, cut_off_V, held))
+            rows.append(row | _row_of(discharge, cut_off_V, held, unsure))
         except ValueError as error:  # of one that cannot be used
-            rows.append(row | {"settled": False, "valid": False, "findings": (Finding.of(Reason.OTHER, message=str(error)),)})
-    life = life_of(pd.DataFrame([{**row, "reason": reason_of(row["findings"])} for row in rows], columns=_COLUMNS))
+            rows.append(
+                row
+                | {
+                    "settled": False,
+                    "settled_resistance_10s": False,
+                    "valid": False,
+                    "findings": (Finding.of(Reason.OTHER, message=str(error)),),
+                }
+            )
+    texts = [{"reason": reason_of(row["findings"])} for row in rows]
+    life = life_of(pd.DataFrame([row | text for row, text in zip(rows, texts, strict=True)], columns=_COLUMNS))
     last = discharges[int(np.flatnonzero(life.table["valid"])[-1])]
     estimate = unsure.estimate(last.loaded_part(cut_off_V))
     return replace(life, sd_share=estimate.sd_q_mobile / estimate.q_mobile, usual_start=usual_start)
@@ -253,16 +265,21 @@ def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> Discharge
     return usual_start(alike) if len(steps) and np.median(steps) <= VARIED_SHARE else None
 
 
-def _row_of(discharge: Discharge, cut_off_V: float, calibrator: LeastSquares) -> dict[str, Any]:
-    """What one discharge says alone."""
+def _row_of(discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: LeastSquares) -> dict[str, Any]:
+    """What one discharge says alone; of its resistance with constants that are not held, as they age, too."""
     record = discharge.loaded_part(cut_off_V)
-    estimate = calibrator.estimate(record)
-    end_s = calibrator.model.forecast(record, estimate, cut_off_V).eod_time_s
+    estimate = held.estimate(record)
+    of_its_own = estimate if held.nuisance == unsure.nuisance else unsure.estimate(record)
+    end_s = held.model.forecast(record, estimate, cut_off_V).eod_time_s
     capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
     return {
         "q_mobile_C": estimate.q_mobile,
         "sd_q_mobile_C": estimate.sd_q_mobile,
+        "resistance_10s_ohm": of_its_own.resistance_10s_ohm,
+        "sd_resistance_10s_ohm": of_its_own.sd_resistance_10s_ohm,
+        "measured_resistance_10s_ohm": measured_resistance_ohm(record, record.starts_at_rest),
+        "settled_resistance_10s": of_its_own.settled_resistance_10s,
         "r_o_ohm": estimate.r_o,
         "settled": estimate.settled,
         "findings": estimate.findings,

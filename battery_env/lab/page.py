@@ -1,4 +1,4 @@
-"""The page for the bench, ``battery-calibrate page``: files in, q_max, R_o, health, life and the end of a discharge out."""
+"""The page for the bench, ``battery-calibrate page``: files in, q_max, resistance, health, life and the end out."""
 
 import os
 import tempfile
@@ -30,8 +30,9 @@ LAYOUT = {"height": 330, "margin": {"t": 30, "b": 30}, "legend": {"orientation":
 SHORT = {
     "q_max (Ah)": "q_mobile_C",
     "sd (Ah)": "sd_q_mobile_C",
-    "R_o (mohm)": "r_o_ohm",
-    "sd (mohm)": "sd_r_o_ohm",
+    "10 s resistance (mohm)": "resistance_10s_ohm",
+    "sd (mohm)": "sd_resistance_10s_ohm",
+    "measured (mohm)": "measured_resistance_10s_ohm",
     "state of health": "state_of_health",
 }
 # What can be stated of files: where a quantity stands and in which unit, the sign of a discharge, the charge at its start.
@@ -156,7 +157,8 @@ def looked_at(name: str, cell: str, recording: Recording, settings: Settings) ->
 def show_numbers(says: Calibration) -> None:
     """The numbers of a discharge, each with its standard deviation."""
     *places, settled = st.columns(4)
-    columns = {"q_max": "q_mobile_C", "R_o": "r_o_ohm", "state of health": "state_of_health"}
+    resistance = {"r_o": ("R_o", "r_o_ohm"), "resistance_10s": ("10 s resistance", "resistance_10s_ohm")}[says.resistance]
+    columns = {"q_max": "q_mobile_C", resistance[0]: resistance[1], "state of health": "state_of_health"}
     for place, (label, name) in zip(places, columns.items(), strict=True):
         sd = "" if np.isnan(getattr(says, name)) else f"sd {says.sd_of(name) or 'not stated'}"
         place.metric(label, says.shown(name), sd, "off", delta_arrow="off")
@@ -239,7 +241,7 @@ def main() -> None:
         show_numbers(chosen.says)
         left, right = st.columns(2)
         left.plotly_chart(over_the_life(lives, "q_mobile_C", "q_max (Ah)", 1.0 / 3600.0))
-        right.plotly_chart(over_the_life(lives, "r_o_ohm", "R_o (mohm)", 1e3))
+        right.plotly_chart(over_the_life(lives, "resistance_10s_ohm", "10 s resistance (mohm)", 1e3))
         show_end(chosen, before, state.settings)
     short = [{label: each.says.shown(name, with_unit=False) for label, name in SHORT.items()} for each in found]
     settled = [each.says.state for each in found]

@@ -11,14 +11,13 @@ import numpy as np
 from battery_env.estimates.findings import SETTLED_SHARES, Finding, reason_of
 from battery_env.lab.forecast import Forecast, decimals
 from battery_env.lab.settings import Settings
-from battery_env.parameters import PARAMETERS
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import VoltageForecast
 
 #: The methods, for readers of a figure.
 METHOD_NAMES = {"least-squares": "least squares", "policy": "policy"}
-# Columns of the parameters.
-_COLUMN_OF = {name: f"{name}_{parameter.unit}" for name, parameter in PARAMETERS.items()}
+# Columns of the numbers that are judged.
+_COLUMN_OF = {"q_mobile": "q_mobile_C", "resistance_10s": "resistance_10s_ohm", "r_o": "r_o_ohm"}
 
 
 def quantity(text: str = "", unit: str = "", digits: int = 0, scale: float = 1.0) -> Any:
@@ -46,10 +45,14 @@ class Calibration:
     method: str = quantity()
     q_mobile_C: float = quantity("q_max", "Ah", 3, 1.0 / 3600.0)
     sd_q_mobile_C: float = quantity("sd", "Ah", 3, 1.0 / 3600.0)
+    resistance_10s_ohm: float = quantity("10 s resistance", "mohm", 1, 1e3)
+    sd_resistance_10s_ohm: float = quantity("sd", "mohm", 1, 1e3)
+    measured_resistance_10s_ohm: float = quantity("measured", "mohm", 1, 1e3)
     r_o_ohm: float = quantity("R_o", "mohm", 1, 1e3)
     sd_r_o_ohm: float = quantity("sd", "mohm", 1, 1e3)
     settled: bool = quantity("settled")
     settled_q_mobile: bool = quantity("q_max")
+    settled_resistance_10s: bool = quantity("10 s resistance")
     settled_r_o: bool = quantity("R_o")
     findings: tuple[Finding, ...] = quantity()
     initial_soc: float = quantity("charge at the start", "%", 1, 100.0)
@@ -114,9 +117,14 @@ class Calibration:
 
     @property
     def settled_alone(self) -> str:
-        """The parameter that is settled though the other one is not; empty if none is."""
-        known = [name for name in ("settled_q_mobile", "settled_r_o") if getattr(self, name)]
+        """The number that is settled though the other one is not; empty if none is."""
+        known = [name for name in ("settled_q_mobile", f"settled_{self.resistance}") if getattr(self, name)]
         return "" if self.settled else "".join(_HOW[name]["text"] for name in known)
+
+    @property
+    def resistance(self) -> str:
+        """Which resistance counts: that after ten seconds, or where there is none that of the model, by its name."""
+        return "r_o" if np.isnan(self.resistance_10s_ohm) else "resistance_10s"
 
     @property
     def state(self) -> str:
@@ -133,6 +141,7 @@ _HOW = {each.name: each.metadata for each in fields(Calibration) if each.metadat
 # The columns of a line, with their widths and digits.
 _IN_A_LINE = (
     ("q_mobile_C", 8, None),
+    ("resistance_10s_ohm", 0, None),
     ("r_o_ohm", 0, None),
     ("drawn_Ah", 0, None),
     ("state_of_health", 0, None),
@@ -162,11 +171,15 @@ def _rows_of_text(found: Calibration) -> Iterator[tuple[str, str]]:
     """The columns that a text has, in their order, each with a remark."""
     if found.initial_soc < 1.0 or found.sd_initial_soc:
         yield "initial_soc", f"sd {found.shown('sd_initial_soc')}"
-    for parameter, column in _COLUMN_OF.items():
+    for name, column in _COLUMN_OF.items():
+        if np.isnan(getattr(found, column)):
+            continue
         sd = f"sd {found.shown(f'sd_{column}')}" if found.sd_of(column) else "no sd stated"
-        value, sd_value, needed = getattr(found, column), getattr(found, f"sd_{column}"), SETTLED_SHARES[parameter]
+        value, sd_value, needed = getattr(found, column), getattr(found, f"sd_{column}"), SETTLED_SHARES[name]
         too_wide = f", {sd_value / value:.0%}: settled below {needed:.0%}" if sd_value > needed * value > 0.0 else ""
-        yield column, f"{sd}{too_wide}"
+        measured = f", measured {found.shown('measured_resistance_10s_ohm')}" if name == "resistance_10s" else ""
+        of_model = ", of the model with its constants" if name != found.resistance and name == "r_o" else ""
+        yield column, f"{sd}{too_wide}{measured}{of_model}"
     yield "settled", f"only {found.settled_alone} is" if found.settled_alone else ""
     yield "drawn_Ah", _of_the_charge(found)
     if not np.isnan(found.nominal_Ah):
@@ -209,7 +222,8 @@ def _numbers(found: Calibration) -> list[str]:
     """The columns of a line."""
     parts = []
     for column, width, digits in _IN_A_LINE:
-        if not np.isnan(getattr(found, column)):
+        is_second = column == "r_o_ohm" and found.resistance != "r_o"
+        if not (np.isnan(getattr(found, column)) or is_second):
             sd, label = found.sd_of(column), _HOW[column]["text"].split()[-1]
             parts.append(f"{label} {found.shown(column, digits):>{width}}" + (f" sd {sd:>3}" if sd else ""))
     return parts

@@ -66,6 +66,7 @@ class End:
             "remaining_s": found.remaining_s,
             "soc": found.soc,
             "q_mobile_C": found.q_mobile,
+            "resistance_10s_ohm": found.resistance_10s_ohm,
             "r_o_ohm": found.r_o,
             "capacity_Ah": found.capacity_Ah,
             "state_of_health": found.state_of_health,

@@ -174,15 +174,17 @@ def test_the_table_decides_what_is_said_first_whoever_notes_it():
 
     def verdict(diagnosis, share_q, share_r_o, known=None):
         sds = {"q_mobile": share_q * values["q_mobile"], "r_o": share_r_o * values["r_o"]}
-        return diagnosis.verdict(values, sds, ["q_mobile", "r_o"], known=known)
+        found = diagnosis.verdict(values, sds, ["q_mobile", "r_o"], known=known)
+        assert not found.settled_resistance_10s  # none is stated
+        return found[:3]
 
     assert verdict(Diagnosis(), 0.01, 0.2) == (True, True, ())
     scale_q, imprecise_r_o = Finding("scale_unknown", "q_mobile"), Finding("imprecise", "r_o")
     assert verdict(Diagnosis(), 0.01, 0.6) == (True, False, (imprecise_r_o,))
-    assert Diagnosis().verdict(values, {}) == (True, True, ())  # of numbers that are held nothing is found
+    assert Diagnosis().verdict(values, {}) == (True, True, (), False)  # of numbers that are held nothing is found
     # that of the number that is farther beyond its limit
     assert verdict(Diagnosis(), 0.04, 0.5, gain) == (False, False, (scale_q, imprecise_r_o))
-    assert verdict(Diagnosis(), 0.04, 0.7, gain).findings == (imprecise_r_o, scale_q)
+    assert verdict(Diagnosis(), 0.04, 0.7, gain)[2] == (imprecise_r_o, scale_q)
     # one against both hides what is against one
     diagnosis = Diagnosis()
     diagnosis.note(Reason.MISFIT, False)
@@ -194,11 +196,27 @@ def test_the_table_decides_what_is_said_first_whoever_notes_it():
     assert not is_only_imprecise([]) and not is_only_imprecise([Finding("gap", "q_mobile")])
 
 
+def test_where_a_resistance_is_stated_it_counts_in_place_of_that_of_the_model():
+    values = {"q_mobile": 6000.0, "r_o": 0.1, "resistance_10s": 0.11}
+
+    def verdict(diagnosis, r_o_ohm, resistance_ohm, **known):
+        sds = {"q_mobile": 60.0, "r_o": r_o_ohm, "resistance_10s": resistance_ohm}
+        return diagnosis.verdict(values, sds, list(values), known=Assumptions(**known))
+
+    assert verdict(Diagnosis(), 0.05, 0.01) == (True, False, (), True)
+    assert verdict(Diagnosis(), 0.01, 0.05) == (True, True, (Finding("imprecise", "resistance_10s"),), False)
+    in_doubt = Finding("load_on", "resistance_10s", {"in_doubt_ohm": 0.045})
+    assert verdict(Diagnosis(), 0.01, 0.05, load_on_ohm=0.045) == (True, True, (in_doubt,), False)
+    diagnosis = Diagnosis()
+    diagnosis.note(Reason.MISFIT)
+    assert verdict(diagnosis, 0.01, 0.01) == (False, False, (Finding("misfit"),), False)
+
+
 #: All that findings are told of, but for words; names end with units.
 MEASURED = {
     **dict.fromkeys("first_V rest_V charge_V rise_V first_A usual_A charge_A offset_A load_A change_A".split(), 0.2),
     **dict.fromkeys("least_fitted_A most_fitted_A fault_s gap_start_s gap_end_s drawn_C moved_C missed_C".split(), 0.2),
-    **dict.fromkeys("initial_soc switches ratio".split(), 0.2),
+    **dict.fromkeys("initial_soc switches ratio after_s step_s measured_ohm model_ohm apart_sd".split(), 0.2),
 }
 
 
