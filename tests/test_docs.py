@@ -10,7 +10,7 @@ from PIL import Image
 
 from battery_env.__main__ import calibrate
 from battery_env.estimates.findings import CODES, Finding
-from battery_env.parameters import PARAMETER_NAMES
+from battery_env.estimators.verdict import NUMBERS
 from checks.pages import DOCS, PAGES, ROOT, blocks, docstring_examples
 from sb3_lac.checks import advice_for_a_time_limit
 from sb3_lac.stability import NoCostError, fitting, report
@@ -129,7 +129,7 @@ def test_each_finding_has_a_row_of_remedies_by_its_code_and_its_own_words():
     for of_row, (_, says) in zip(codes, rows, strict=True):
         texts = [CODES[code].text for code in of_row]
         if of_row == ["imprecise"]:
-            texts = [str(Finding("imprecise", number)) for number in PARAMETER_NAMES]
+            texts = [str(Finding("imprecise", number)) for number in NUMBERS]
         words = re.findall('"(.*?)"', says)
         assert of_row == ["other"] or [len([each for each in words if each in text]) for text in texts] == [1] * len(texts)
         assert all(any(each in text for text in texts) for each in words), words

@@ -66,7 +66,7 @@ def test_a_folder_of_one_cell_shows_its_numbers_its_life_and_the_end_of_a_discha
     says = calibrate(folder / "3.csv", nominal_Ah=2.0)[0]
     assert numbers(page) == {
         "q_max": f"{says.q_mobile_C / 3600.0:.3f} Ah",
-        "R_o": f"{1e3 * says.r_o_ohm:.1f} mohm",
+        "10 s resistance": f"{1e3 * says.resistance_10s_ohm:.1f} mohm",
         "state of health": f"{says.state_of_health:.3f}",
         "settled": "yes",
     }

@@ -1,0 +1,86 @@
+"""The resistance after ten seconds: what a meter shows of a cell, by the fitted model and as measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from battery_env import Discharge, calibrate, load_nasa_discharges, simulate
+from battery_env.estimators.resistance import later_step, load_on, measured_resistance_ohm
+from tests.sweeps import sweep
+
+SIMULATED = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.69)
+FALL_OHM = float(SIMULATED.voltage_V[0] - SIMULATED.voltage_V[10]) / 2.0
+
+
+def recorded(trajectory, starts_at_rest=True, current_A=None):
+    current_A = trajectory.current_A if current_A is None else current_A
+    return Discharge(trajectory.time_s, trajectory.voltage_V, current_A, starts_at_rest=starts_at_rest)
+
+
+def late(time_s, values, constant_s):
+    """Values of a sensor that lags."""
+    out = np.array(values)
+    for k in range(1, len(out)):
+        out[k] = out[k - 1] - np.expm1(-(time_s[k] - time_s[k - 1]) / constant_s) * (values[k] - out[k - 1])
+    return out
+
+
+def test_it_is_the_fall_from_rest_to_ten_seconds_over_the_current():
+    found = calibrate(recorded(SIMULATED))
+    assert found.settled and found.resistance_10s_ohm == pytest.approx(FALL_OHM, rel=0.01)
+    assert found.measured_resistance_10s_ohm == pytest.approx(FALL_OHM, rel=1e-3)
+    assert found.sd_resistance_10s_ohm < 0.1 * FALL_OHM
+    assert "10 s resistance" in str(found) and f"measured {1e3 * FALL_OHM:.1f} mohm" in str(found)
+
+
+def test_without_a_rest_it_is_blank_and_that_of_the_model_counts():
+    found = calibrate(recorded(SIMULATED, starts_at_rest=False))
+    assert np.isnan([found.resistance_10s_ohm, found.measured_resistance_10s_ohm]).all()
+    assert found.settled and found.settled_r_o and not found.settled_resistance_10s
+    assert "10 s resistance" not in str(found)
+
+
+def test_rows_that_lie_far_apart_show_no_measured_resistance():
+    record = recorded(SIMULATED)
+    for every_s, is_shown in ((2, True), (30, False)):
+        rows = Discharge(
+            record.time_s[::every_s], record.voltage_V[::every_s], record.current_A[::every_s], starts_at_rest=True
+        )
+        assert np.isfinite(measured_resistance_ohm(rows, True)) == is_shown
+    assert not load_on(recorded(simulate(np.tile([2.0] * 5 + [0.0] * 25, 40), 6000.0, 0.15, load_unit="current")), True).stays
+
+
+@pytest.mark.parametrize("number", sweep(49, 1, 121))
+def test_a_current_that_lags_settles_no_resistance(number):
+    record = load_nasa_discharges("B0005")[number - 1]
+    for constant_s in (10.0, 30.0):
+        lagging = replace(record, current_A=late(record.time_s, record.current_A, constant_s))
+        sound, found = calibrate(record), calibrate(lagging)
+        off_ohm = abs(found.resistance_10s_ohm - sound.resistance_10s_ohm)
+        assert sound.settled_resistance_10s
+        assert not found.settled_resistance_10s or off_ohm < 3.0 * found.sd_resistance_10s_ohm
+    assert [each.code for each in found.findings] == ["resistance_differs"] and not found.settled_q_mobile
+    assert set(found.findings[0].measured) == {"after_s", "step_s", "measured_ohm", "model_ohm", "apart_sd"}
+
+
+def test_without_a_rest_a_later_switch_is_compared():
+    pulsed_A = np.tile(np.concatenate([np.full(200, 2.0), np.full(100, 0.5)]), 20)
+    trajectory = simulate(pulsed_A, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.8)
+    sound = recorded(trajectory, starts_at_rest=False)
+    assert load_on(sound, False) is None and later_step(sound).on_s == pytest.approx(300.0, abs=1.0)
+    assert not calibrate(sound, mismatch_V=0.01).findings
+    lagging = recorded(trajectory, False, late(trajectory.time_s, trajectory.current_A, 20.0))
+    (finding,) = calibrate(lagging, mismatch_V=0.01).findings
+    assert finding.code == "resistance_differs" and finding.measured["step_s"] == pytest.approx(300.0, abs=20.0)
+
+
+def test_it_rises_with_age_as_the_measured_one_does():
+    for cell in ("B0005", "B0006"):
+        young, old = (calibrate(load_nasa_discharges(cell)[number - 1]) for number in (49, 157))
+        rise, measured = (
+            getattr(old, f"{name}resistance_10s_ohm") / getattr(young, f"{name}resistance_10s_ohm")
+            for name in ("", "measured_")
+        )
+        assert rise > 1.2 and rise == pytest.approx(measured, abs=0.07)
+        assert old.resistance_10s_ohm == pytest.approx(old.measured_resistance_10s_ohm, rel=0.1)
