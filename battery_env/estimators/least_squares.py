@@ -390,10 +390,12 @@ class LeastSquares(Estimator):
                 continue
             measured_ohm = step.fall_ohm(record, record.time_s, record.voltage_V, after_s)
             model_ohm = step.fall_ohm(record, record.time_s, model_V, after_s)
-            sd_ohm = root * ModelResistance.of(record, step, fitted.search, fitted.alone, after_s).sd_ohm
+            of_model = ModelResistance.of(record, step, fitted.search, fitted.alone, after_s)
+            sd_ohm = root * of_model.sd_ohm
             noise_ohm = MOST_NOISE_SD * root * fitted.search.error.noise_V / step.size_A
             apart_ohm = abs(measured_ohm - model_ohm)
-            if apart_ohm > hypot(RESISTANCE_LIMIT_SD * sd_ohm, noise_ohm):
+            # the moment of the switch may be another one in what was measured, and in what was fitted
+            if apart_ohm > 2.0 * of_model.moment_ohm + hypot(RESISTANCE_LIMIT_SD * sd_ohm, noise_ohm):
                 found = {"after_s": after_s, "step_s": step.on_s, "measured_ohm": measured_ohm, "model_ohm": model_ohm}
                 return {**found, "apart_sd": apart_ohm / sd_ohm}
         return {}

@@ -76,11 +76,13 @@ class ModelResistance(NamedTuple):
     :param sd_ohm: its standard deviation, for residuals of one
     :param per_s: how much of it a second makes by which the step may be earlier or later, ohm/s, or at the first sample under
         the load, where that is later
+    :param moment_ohm: how far it is at most from that of a step as early or as late as the samples allow, ohm
     """
 
     ohm: float
     sd_ohm: float
     per_s: float
+    moment_ohm: float
 
     @classmethod
     def of(cls, record: Record, step: LoadStep, search: Search, fit: Fit, after_s: float = PULSE_S) -> ModelResistance:
@@ -88,9 +90,14 @@ class ModelResistance(NamedTuple):
         grid_s, voltages = record.time_s[0] + search.data.grid_s, search.voltage(fit.values)
         ohm, *by_unknown = (step.fall_ohm(record, grid_s, each, after_s) for each in voltages)
         sd_ohm = root_variance(fit.jacobian, np.array(by_unknown))
-        first_s = max(step.on_s + after_s, float(record.time_s[step.before + 1]))
-        before_V, after_V = np.interp([first_s - 1.0, first_s + 1.0], grid_s, voltages[0])
-        return cls(ohm, sd_ohm, abs(float(before_V - after_V)) / 2.0 / step.size_A)
+        first_s = float(record.time_s[step.before + 1])
+        center_s, half_s = max(after_s, first_s - step.on_s), first_s - step.on_s
+        earlier_ohm, later_ohm, early_ohm, late_ohm = (
+            step.fall_ohm(record, grid_s, voltages[0], each_s)
+            for each_s in (center_s - 1.0, center_s + 1.0, after_s - half_s, after_s + half_s)
+        )
+        moment_ohm = max(abs(ohm - early_ohm), abs(ohm - late_ohm))
+        return cls(ohm, sd_ohm, 0.5 * abs(later_ohm - earlier_ohm), moment_ohm)
 
 
 def _moment_s(record: Record, before: int) -> float:
