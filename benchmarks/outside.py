@@ -9,9 +9,10 @@ LAC beside SAC, TD3 and TQC on tasks of Gymnasium, which nobody here made or tun
 
 Every algorithm has its defaults, but SAC, TD3 and TQC those settings of the RL Zoo that are tuned for a task with at most 50
 thousand steps; ``lac_zoo`` is LAC with those of SAC. ``lac_common`` is LAC with its one setting for control problems. The
-critics of ``lac_fourth_root`` learn that root, and of those the weight of the entropy begins at 1 in ``lac_higher_start``, as
-SAC's does. A policy is judged by its mean action, in 20 episodes that no training starts with. A training that is done is a
-row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command goes on from there.
+critics of ``lac_square_root`` and ``lac_fourth_root`` learn that root, and the weight of the entropy begins at 1 in
+``lac_higher_start``, as SAC's does. A policy is judged by its mean action, in 20 episodes that no training starts with. A
+training that is done is a row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command goes
+on from there.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ TASKS = {
     "Pusher-v5": 10_000,
     "Hopper-v5": 20_000,
 }
-_FOURTH_ROOT = {"policy_kwargs": "dict(root=4)"}
+_SQUARE_ROOT, _FOURTH_ROOT = ({"policy_kwargs": f"dict(root={root})"} for root in (2, 4))
 #: Algorithms by their names on the command line: what readers call them, the class, and what differs from its defaults; None
 #: is for those that are trained only where TUNED has settings.
 ALGORITHMS: dict[str, tuple[str, str, dict[str, Any] | None]] = {
@@ -52,13 +53,14 @@ ALGORITHMS: dict[str, tuple[str, str, dict[str, Any] | None]] = {
     "published_lac": ("LAC as published", "sb3_lac:PublishedLAC", {}),
     "lac_common": ("LAC (root=4), its one setting", "sb3_lac:LAC", setting_of_lac()),
     "lac_zoo": ("LAC, the RL Zoo's settings of SAC", "sb3_lac:LAC", None),
+    "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC", _SQUARE_ROOT),
     "lac_fourth_root": ("LAC (root=4)", "sb3_lac:LAC", _FOURTH_ROOT),
     "lac_higher_start": ("LAC (root=4), entropy from 1", "sb3_lac:LAC", {"ent_coef": "auto", **_FOURTH_ROOT}),
     "sac": ("SAC", "stable_baselines3:SAC", {}),
     "td3": ("TD3", "stable_baselines3:TD3", {}),
     "tqc": ("TQC", "sb3_contrib:TQC", {}),
 }
-OURS = ("lac", "lac_fourth_root", "lac_zoo")
+OURS = ("lac", "lac_square_root", "lac_fourth_root", "lac_zoo")
 RIVALS = ("published_lac", "sac", "td3", "tqc")
 _CAR = {
     "learning_rate": 3e-4,
