@@ -39,10 +39,14 @@ class LoadStep(NamedTuple):
         return float(before_V - after_V) / self.size_A
 
     def is_seen(self, record: Record, after_s: float = PULSE_S) -> bool:
-        """Whether samples under the load lie so much later on both sides, near enough to tell the voltage there."""
+        """Whether samples lie so much later on both sides, near enough to tell the voltage there, before another switch."""
         after = int(np.searchsorted(record.time_s, self.on_s + after_s))
-        is_between = self.before + 1 < after < len(record.time_s)
-        return is_between and bool(record.time_s[after] - record.time_s[after - 1] <= 2.0 * PULSE_S)
+        if not self.before + 1 < after < len(record.time_s):
+            return False
+        # a current that lags is one that has not settled yet, and no other switch
+        settles = np.abs(np.diff(record.current_A[self.before + 1 : after + 1])) <= SWITCH_SHARE * self.size_A
+        is_switched = bool((settles[:-1] & ~settles[1:]).any())
+        return not is_switched and bool(record.time_s[after] - record.time_s[after - 1] <= 2.0 * PULSE_S)
 
 
 def load_on(record: Record, starts_at_rest: bool) -> LoadStep | None:

@@ -77,6 +77,14 @@ def test_without_a_rest_a_later_switch_is_compared_whatever_its_moment():
         assert np.isnan(found.resistance_10s_ohm)
 
 
+def test_what_is_measured_after_another_switch_is_no_resistance_of_the_first():
+    record = recorded(simulate(np.repeat([1.0, 2.5, 0.8, 2.0] * 60, 60), 6000.0, 0.15, load_unit="current", cut_off_V=2.69))
+    rows = Discharge(record.time_s[::5], record.voltage_V[::5], record.current_A[::5])
+    step = later_step(rows)
+    assert step.is_seen(rows, 10.0) and not step.is_seen(rows, 60.0)
+    assert "resistance_differs" not in [each.code for each in calibrate(rows).findings]
+
+
 def test_it_rises_with_age_as_the_measured_one_does():
     for cell in ("B0005", "B0006"):
         young, old = (calibrate(load_nasa_discharges(cell)[number - 1]) for number in (49, 157))
