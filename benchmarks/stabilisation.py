@@ -89,6 +89,7 @@ class Contender:
     :param settings: whose ``default`` entry of ``zoo_configs`` it has in place of its own for each problem
     :param hyperparameters: what differs from that
     :param compiles: whether its updates can be compiled
+    :param typed: whether it is ``ALGO("MlpPolicy", env_id)`` as typed, with the defaults of its class in place of an entry
     """
 
     algo: str
@@ -98,11 +99,14 @@ class Contender:
     settings: str | None = None
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
     compiles: bool = False
+    typed: bool = False
 
     def recipe(self, env_id: str, seed: int, timesteps: int | None) -> Recipe:
         """What it is trained by."""
         differing = dict(self.hyperparameters)
-        return Recipe.of(self.algo, env_id, seed, timesteps, hyperparameters=differing, settings=self.settings)
+        return Recipe.of(
+            self.algo, env_id, seed, timesteps, hyperparameters=differing, settings=self.settings, defaults=self.typed
+        )
 
     def trained(self, recipe: Recipe, digest: str | None, folder: Path, compiled: bool) -> Trained:
         """Train it, unless that has been done."""
@@ -135,6 +139,10 @@ _NOISE = {"noise_type": "normal", "noise_std": 0.1}
 #: Who is judged, by the name on the command line.
 CONTENDERS = {
     "lac": Contender("lac", "LAC", COLOUR_OF["LAC"], "o", compiles=True),
+    "lac_as_typed": Contender("lac", "LAC, as typed", COLOUR_OF["LAC"], "p", compiles=True, typed=True),
+    "lac_default_root": Contender(
+        "lac", "LAC, its default root", COLOUR_OF["LAC"], "h", hyperparameters=_NETWORKS, compiles=True
+    ),
     "lac_square_root": Contender("lac", "LAC (root=2)", COLOUR_OF["LAC"], "d", hyperparameters=_SQUARE_ROOT, compiles=True),
     "published_lac": Contender("published_lac", "LAC as published", COLOUR_OF["LAC as published"], "P", compiles=True),
     "published_lac_paper": Contender(

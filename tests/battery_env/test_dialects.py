@@ -139,7 +139,7 @@ def write(f, folder):
 
 
 @pytest.mark.attacks
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.fixed_dictionaries({name: st.sampled_from(values) for name, values in FEATURES.items()}))
 def test_whatever_is_put_together_the_discharges_are_those_that_were_written(tmp_path, f):
     if f["encoding"] == "latin-1":
