@@ -47,8 +47,8 @@ class KnownLoad(ABC):
 @dataclass(frozen=True, eq=False)
 class Load(KnownLoad):
     """
-    A piecewise-constant load. Value k holds from ``start_s[k]`` (included) to ``start_s[k + 1]`` (excluded), the last one
-    for ever.
+    A piecewise-constant load. Value k holds from ``start_s[k]`` (included) to ``start_s[k + 1]`` (excluded), and the last
+    value for ever.
 
     :param start_s: start of each segment, s, shape (K,), the first 0, increasing
     :param value: power in W or current in A, positive in discharge, shape (K,)
@@ -104,10 +104,10 @@ class Load(KnownLoad):
 @dataclass(frozen=True, eq=False)
 class Cycle(KnownLoad):
     """
-    A load that starts again and again: a mission, a drive cycle, a pulse.
+    A load that repeats: a mission, a drive cycle, a pulse.
 
     :param load: one cycle
-    :param period_s: after which it starts again, s
+    :param period_s: time after which the load repeats, s
     :raises ValueError: for a period that is not positive
     """
 

@@ -101,7 +101,7 @@ class FittedDischarge:
 @dataclass(frozen=True)
 class CellFit:
     """
-    The constants of a cell as :func:`fit_cell` found them, for any calibrator:
+    The constants of a cell from :func:`fit_cell`, for any calibrator:
 
     .. code-block:: python
 
@@ -112,15 +112,15 @@ class CellFit:
 
     :param cell: the constants, with ``q_mobile`` and ``r_o`` of the discharge with the largest ``q_mobile``, and the cut-off
         voltage as ``VEOD``
-    :param start: the constants before, with the same ``q_mobile``, ``r_o`` and ``VEOD``
-    :param mismatch_V: error to expect of the model with these constants, V, also at ages that were not fitted
+    :param start: the constants before the fit, with the same ``q_mobile``, ``r_o`` and ``VEOD``
+    :param mismatch_V: expected error of the model with these constants, V, also at ages outside the fit
     :param rmse_V: root mean square of the residuals, V
-    :param thermal: whether the temperature of the model moves
-    :param constants: what the discharges say about each constant
-    :param discharges: the discharges
-    :param usual_start: how these start, which is full for this cell; ``None``: not alike, or in files of fits that were made
-        without it
-    :raises TypeError: for a value of another kind
+    :param thermal: whether the temperature of the model changes
+    :param constants: the result for each constant
+    :param discharges: the result for each discharge
+    :param usual_start: how the discharges start, which means full for this cell; ``None``: they start differently, or the file
+        of the fit has no start
+    :raises TypeError: for a value of another type
     :raises ValueError: for errors that are not positive, and numbers that are not finite
     """
 
