@@ -74,17 +74,17 @@ class FittedConstant:
 @dataclass(frozen=True)
 class FittedDischarge:
     """
-    What a fit says of one of its discharges.
+    The result of a fit for one of its discharges.
 
-    :param name: of the cell and the discharge, if the record tells; otherwise its number
+    :param name: name of the cell and number of the discharge, if the record has both; otherwise the position
     :param q_mobile: charge that can move, C
     :param r_o: ohmic resistance, ohm
-    :param sd_q_mobile: its standard deviation, with that of the constants, C
-    :param sd_r_o: likewise, ohm
+    :param sd_q_mobile: standard deviation of ``q_mobile``, with the uncertainty of the constants, C
+    :param sd_r_o: standard deviation of ``r_o``, with the uncertainty of the constants, ohm
     :param rmse_V: root mean square of the voltage error, V
-    :param rmse_before_V: likewise with the constants known before and the ``q_mobile`` and ``r_o`` that fit best to them
-    :param left_out_V: likewise with constants that were fitted without this discharge; ``None`` if there are no others
-    :param current_A: its mean current, A; ``None`` in files of fits that were made without it
+    :param rmse_before_V: the same with the constants before the fit, and the best ``q_mobile`` and ``r_o`` for them
+    :param left_out_V: the same with constants fitted without this discharge; ``None`` if there are no others
+    :param current_A: mean current, A; ``None`` if the file of the fit has none
     """
 
     name: str

@@ -349,9 +349,9 @@ def load_nasa_discharges(cell: str) -> list[Discharge]:
     ``ambient_temperature_C``, ``capacity_Ah`` (charge to 2.7 V), ``Re_ohm`` and ``Rct_ohm`` (of the impedance test nearest in
     time) and ``test_id`` (position among all tests of the cell).
 
-    :param cell: one that comes with the package (``BUNDLED_CELLS``). NASA's own files of others, such as ``B0018.mat``, are
-        read by :func:`battery_env.read_discharges`
-    :return: one :class:`Discharge` each
+    :param cell: a cell of the package (``BUNDLED_CELLS``). For NASA's own files of other cells, such as ``B0018.mat``, use
+        :func:`battery_env.read_discharges`
+    :return: the discharges
     :raises FileNotFoundError: if there is no such cell
     """
     if cell not in BUNDLED_CELLS:
