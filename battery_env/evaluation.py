@@ -57,12 +57,12 @@ def evaluate(
     ``p_settling_time_1_percent_s``      time since the first sample from which on all estimates are that close; infinite
                                          if the last one is not
     ``p_coverage_percent``               share of the estimates within two stated standard deviations of the truth
-    ``p_bound``                          the Cramér-Rao bound: standard deviation that no unbiased calibrator can be below
-                                         with these sensors
+    ``p_bound``                          the Cramér-Rao bound: least standard deviation of an unbiased calibrator with
+                                         these sensors
     ==================================== =============================================================================
 
-    The bound is from all samples of the voltage. Unknown to it are the parameters that the calibrator states an uncertainty of
-    (both, if it states none) and the offset of the voltage, if there is one.
+    The bound uses all samples of the voltage. Its unknowns are the parameters with a stated uncertainty (both, if the
+    calibrator states none) and the offset of the voltage, if there is one.
 
     And of each discharge:
 
@@ -78,13 +78,13 @@ def evaluate(
     ``time_per_update_s``                wall time of the whole batch over its number of estimates
     ==================================== =============================================================================
 
-    NaN stands for what there is not: no estimate in that part of the discharge, no stated uncertainty, no noise, or a record
-    that does not start at full charge or does not say when it ends.
+    NaN means: no estimate in this part of the discharge, no stated uncertainty, no noise, or a record that does not start at
+    full charge or has no end of discharge.
 
     :param estimator: the calibrator
     :param data: the discharges
-    :param sensor_errors: what the calibrator sees instead of the true voltage and current; ``None``: ``data`` as it is
-    :param seed: seed of the noise; that of one discharge does not depend on the others
+    :param sensor_errors: errors of voltage and current in the records of the calibrator; ``None``: ``data`` without errors
+    :param seed: seed of the noise; the noise of a discharge does not depend on other discharges
     :return: one row per discharge, in their order
     """
     dataset = data if isinstance(data, TrajectoryDataset) else TrajectoryDataset.from_trajectories(data)

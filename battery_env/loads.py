@@ -47,8 +47,8 @@ class KnownLoad(ABC):
 @dataclass(frozen=True, eq=False)
 class Load(KnownLoad):
     """
-    A piecewise-constant load. Value k holds from ``start_s[k]`` (included) to ``start_s[k + 1]`` (excluded), the last one
-    for ever.
+    A piecewise-constant load. Value k holds from ``start_s[k]`` (included) to ``start_s[k + 1]`` (excluded), and the last
+    value for ever.
 
     :param start_s: start of each segment, s, shape (K,), the first 0, increasing
     :param value: power in W or current in A, positive in discharge, shape (K,)
@@ -104,10 +104,10 @@ class Load(KnownLoad):
 @dataclass(frozen=True, eq=False)
 class Cycle(KnownLoad):
     """
-    A load that starts again and again: a mission, a drive cycle, a pulse.
+    A load that repeats: a mission, a drive cycle, a pulse.
 
     :param load: one cycle
-    :param period_s: after which it starts again, s
+    :param period_s: time after which the load repeats, s
     :raises ValueError: for a period that is not positive
     """
 
@@ -167,7 +167,7 @@ LoadSampler = Callable[[np.random.Generator], Load]
 
 class RandomLoad(ABC):
     """
-    A load that is known by its distribution: what :func:`battery_env.forecast` draws from, once a sample.
+    A load with a known distribution: :func:`battery_env.forecast` draws a load for each sample.
     """
 
     @abstractmethod
@@ -257,8 +257,8 @@ class RandomPiecewise(RandomLoad):
 @dataclass(frozen=True)
 class RandomWalk(RandomLoad):
     """
-    A sampler of piecewise-constant loads that remember: each value is the last one plus a step, uniform at random, reflected
-    at the bounds; the first one is uniform between the bounds, and so is then every other.
+    A sampler of piecewise-constant random walks: each value is the last value plus a uniform random step, reflected at the
+    bounds. The first value, and therefore each value, is uniform between the bounds.
 
     :param value_range: lowest and highest value, W or A
     :param largest_step: largest change from one segment to the next, W or A
@@ -316,12 +316,12 @@ def steadier_unit(record: Record) -> LoadUnit:
 @dataclass(frozen=True, eq=False)
 class BlockBootstrap(RandomLoad):
     """
-    A sampler of loads that go on as a record went so far: blocks of it, from random places, one after the other. Within a
-    block the order is kept, so that pulses remain pulses.
+    A sampler of loads that continue a record: random blocks of the record, one after the other. The order within a block
+    stays, so that pulses remain pulses.
 
-    The record is one draw of the load itself, and its mean is not known better than its length allows. So the blocks are
-    drawn twice: as many as the record has make another record that might have been, from which those of the future are
-    drawn. Blocks may run over the end of the record to its start (the circular block bootstrap of Politis and Romano, 1992).
+    The record is one draw of the load, and its length limits the accuracy of its mean. Therefore the blocks are drawn twice:
+    first as many blocks as the record has, which make another possible record; then the future blocks from this record. Blocks
+    may run over the end of the record to its start (the circular block bootstrap of Politis and Romano, 1992).
 
     :param record: one discharge, from load-on, or in progress; a rest before its load is left out
     :param unit: ``"power"`` (voltage times current) or ``"current"``

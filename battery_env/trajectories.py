@@ -73,15 +73,15 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :meth:`simulated`, :meth:`from_trajectories` or :meth:`load`. ``dataset[i]`` is a
     :class:`~battery_env.electrochemistry.Trajectory`, ``dataset[:10]`` a data set.
 
-    It keeps parameters, loads and a state every 64 steps. States between are simulated again when they are asked for, to the
-    same bits.
+    The data set keeps parameters, loads and a state every 64 steps. Access to other states simulates these states again, to
+    the same bits.
 
     :param q_mobile: C, shape (n,)
     :param r_o: ohm, shape (n,)
-    :param factors: what ``UNCERTAIN_CONSTANTS`` (kn, tDiffusion, to, tsn) of each true cell are multiplied by, shape (n, 4);
-        ones where the constants of ``cell`` are exact
-    :param equilibrium_V: what is added to the equilibrium voltage of each true cell, as an
-        :class:`~battery_env.AgingPath` has it, V, shape (n, 8); zeros where that of ``cell`` is exact
+    :param factors: factors of ``UNCERTAIN_CONSTANTS`` (kn, tDiffusion, to, tsn) of each true cell, shape (n, 4); ones if the
+        constants of ``cell`` are exact
+    :param equilibrium_V: additions to the equilibrium voltage of each true cell, as in an
+        :class:`~battery_env.AgingPath`, V, shape (n, 8); zeros if the voltage of ``cell`` is exact
     :param eod_time_s: end of discharge, s after the first sample of the whole discharge, shape (n,); NaN where unknown
     :param load_values: all load profiles end to end, one value a step
     :param load_start: where in ``load_values`` each trajectory's profile starts, shape (n,); trajectories may share a profile

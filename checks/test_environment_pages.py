@@ -84,7 +84,7 @@ def test_the_table_of_arguments_is_that_of_the_options():
 
 
 def test_common_options_are_options_of_all(dataset):
-    names = first_cells("battery_env", "Options that all of them take")
+    names = first_cells("battery_env", "Common options")
     options = {"split": "test", "render_mode": "rgb_array", "episode_steps": 4}
     assert set(names) == {*options, "dataset"}
     for env_id in TASKS:

@@ -66,9 +66,9 @@ class DrawnCells(NamedTuple):
 @dataclass(frozen=True)
 class AgingPath:
     """
-    How cells of one kind age: what :func:`battery_env.fit_life` found along the lives of some of them. Another cell of the
-    kind is thought to be somewhere along one of these lives, a little before its start or beyond its end, and beside it by
-    ``SPREAD_SD``.
+    The path along which cells of one kind age, from :func:`battery_env.fit_life` and the lives of some cells. As a prior,
+    another cell of the kind lies somewhere along one of these lives, a little before its start or beyond its end, and off
+    the life by ``SPREAD_SD``.
 
     .. code-block:: python
 
@@ -77,10 +77,10 @@ class AgingPath:
       cells = TrajectoryDataset.along(path, n=100, loads=[constant(2.0, "current")], seed=0)
       print(LeastSquares(path=path).estimate(load_nasa_discharges("B0005")[80].loaded_part(2.7)))
 
-    :param cell: the constants that all ages share, and those that the others are told from
-    :param lives: of each cell one row of ``PATH_NAMES`` an age, from the youngest on
-    :param mismatch_V: error to expect of the model of a cell at its place, V
-    :raises TypeError: for a value of another kind
+    :param cell: the constants that all ages share, and the reference of all other constants
+    :param lives: for each cell one row of ``PATH_NAMES`` per age, from the youngest age on
+    :param mismatch_V: expected error of the model of a cell at its place, V
+    :raises TypeError: for a value of another type
     :raises ValueError: for a life of less than two ages, rows of another length, or values out of range
     """
 
@@ -105,9 +105,9 @@ class AgingPath:
 
     def draw(self, n: int, seed: int) -> DrawnCells:
         """
-        Draw cells: a life, a place along it, uniformly, and how far the cell lies beside it.
+        Draw cells: a life, a uniform place along the life, and a distance from the life.
 
-        :param n: how many
+        :param n: number of cells
         :param seed: seed of the draw
         :return: the cells
         :raises ValueError: for no cells, or a negative seed

@@ -16,24 +16,24 @@ from battery_env.estimates.findings import Finding, reason_of
 @dataclass(frozen=True)
 class Estimate:
     """
-    What a calibrator believes about a cell.
+    The parameters of a cell as a calibrator estimates them.
 
     :param q_mobile: charge that can move, C
-    :param r_o: ohmic resistance, ohm
-    :param sd_q_mobile: its stated standard deviation, C; NaN if the calibrator states none
-    :param sd_r_o: likewise, ohm
-    :param settled: whether the data determine the estimate, and nothing in the record contradicts it: a fully charged cell
-        says nothing about ``q_mobile``, and a prior alone settles nothing. ``q_mobile`` and the resistance are settled then:
-        that after ten seconds, or where none is stated ``r_o``
-    :param findings: why it is not settled, the largest doubt first; empty if it is
-    :param settled_q_mobile: whether ``q_mobile`` is settled, though ``r_o`` may not be; where ``settled`` is false and nothing
-        is said of either number, neither is
-    :param settled_r_o: likewise
-    :param resistance_10s_ohm: what a meter shows of the cell: the fall of the voltage of the fitted model from rest to ten
-        seconds after load-on, over the current, at the charge, current and temperature of this record; NaN if it has no rest
-    :param sd_resistance_10s_ohm: its stated standard deviation, ohm
-    :param settled_resistance_10s: whether it is settled; false where it is not stated
-    :param constants: what else was found of the cell, by the names of an :class:`~battery_env.AgingPath`; ``None``: nothing
+    :param r_o: ohmic resistance of the model, ohm
+    :param sd_q_mobile: standard deviation of ``q_mobile``, C; NaN if the calibrator states none
+    :param sd_r_o: standard deviation of ``r_o``, ohm; NaN if the calibrator states none
+    :param settled: whether the data determine ``q_mobile`` and the resistance after ten seconds (without this resistance:
+        ``r_o``), and nothing in the record contradicts the estimate. A fully charged cell says nothing about ``q_mobile``, and
+        a prior alone settles nothing
+    :param findings: why the estimate is not settled, with the largest doubt first; empty if settled
+    :param settled_q_mobile: whether ``q_mobile`` is settled, even if ``r_o`` is not. If ``settled`` is false, and nothing is
+        stated about either number, neither is settled
+    :param settled_r_o: whether ``r_o`` is settled
+    :param resistance_10s_ohm: resistance as a meter shows it: the fall of the voltage of the fitted model from rest to ten
+        seconds after load-on, over the current, at the charge, current and temperature of this record; NaN without a rest
+    :param sd_resistance_10s_ohm: standard deviation of ``resistance_10s_ohm``, ohm
+    :param settled_resistance_10s: whether ``resistance_10s_ohm`` is settled; false if not stated
+    :param constants: other estimated constants, by the names of an :class:`~battery_env.AgingPath`; ``None``: none
     """
 
     q_mobile: float
@@ -59,16 +59,16 @@ class Estimate:
 
     @property
     def reason(self) -> str:
-        """The findings as one text, which says what to do."""
+        """The findings as one text, with remedies."""
         return reason_of(self.findings)
 
     def within(self, low_C: float, high_C: float) -> Estimate:
         """
-        Tell the estimate where ``q_mobile`` is known to lie.
+        Restrict ``q_mobile`` to a known range.
 
         :param low_C: least ``q_mobile``, C
-        :param high_C: largest one, C
-        :return: with the mean and the standard deviation that the logarithm of ``q_mobile`` has there
+        :param high_C: largest ``q_mobile``, C
+        :return: the estimate with the mean and the standard deviation of the logarithm of ``q_mobile`` in this range
         """
         from scipy.stats import truncnorm  # here, as it takes long to import
 

@@ -203,11 +203,11 @@ CODES: Mapping[str, Reason | Doubt] = {row.name.lower(): row for row in (*Reason
 @dataclass(frozen=True)
 class Finding:
     """
-    What speaks against an estimate. ``str`` gives it as a text that says what to do.
+    A reason against an estimate. ``str`` returns a text with the remedy.
 
-    :param code: what it is, of the table :data:`CODES`
-    :param number: the number that it is about, ``"q_mobile"``, ``"r_o"`` or ``"resistance_10s"``; empty: the record as a whole
-    :param measured: what was measured, by names with SI units
+    :param code: the kind of the reason, a key of :data:`CODES`
+    :param number: the number in question, ``"q_mobile"``, ``"r_o"`` or ``"resistance_10s"``; empty: the record as a whole
+    :param measured: the measured values, by names with SI units
     """
 
     code: str

@@ -74,17 +74,17 @@ class FittedConstant:
 @dataclass(frozen=True)
 class FittedDischarge:
     """
-    What a fit says of one of its discharges.
+    The result of a fit for one of its discharges.
 
-    :param name: of the cell and the discharge, if the record tells; otherwise its number
+    :param name: name of the cell and number of the discharge, if the record has both; otherwise the position
     :param q_mobile: charge that can move, C
     :param r_o: ohmic resistance, ohm
-    :param sd_q_mobile: its standard deviation, with that of the constants, C
-    :param sd_r_o: likewise, ohm
+    :param sd_q_mobile: standard deviation of ``q_mobile``, with the uncertainty of the constants, C
+    :param sd_r_o: standard deviation of ``r_o``, with the uncertainty of the constants, ohm
     :param rmse_V: root mean square of the voltage error, V
-    :param rmse_before_V: likewise with the constants known before and the ``q_mobile`` and ``r_o`` that fit best to them
-    :param left_out_V: likewise with constants that were fitted without this discharge; ``None`` if there are no others
-    :param current_A: its mean current, A; ``None`` in files of fits that were made without it
+    :param rmse_before_V: the same with the constants before the fit, and the best ``q_mobile`` and ``r_o`` for them
+    :param left_out_V: the same with constants fitted without this discharge; ``None`` if there are no others
+    :param current_A: mean current, A; ``None`` if the file of the fit has none
     """
 
     name: str
@@ -101,7 +101,7 @@ class FittedDischarge:
 @dataclass(frozen=True)
 class CellFit:
     """
-    The constants of a cell as :func:`fit_cell` found them, for any calibrator:
+    The constants of a cell from :func:`fit_cell`, for any calibrator:
 
     .. code-block:: python
 
@@ -112,15 +112,15 @@ class CellFit:
 
     :param cell: the constants, with ``q_mobile`` and ``r_o`` of the discharge with the largest ``q_mobile``, and the cut-off
         voltage as ``VEOD``
-    :param start: the constants before, with the same ``q_mobile``, ``r_o`` and ``VEOD``
-    :param mismatch_V: error to expect of the model with these constants, V, also at ages that were not fitted
+    :param start: the constants before the fit, with the same ``q_mobile``, ``r_o`` and ``VEOD``
+    :param mismatch_V: expected error of the model with these constants, V, also at ages outside the fit
     :param rmse_V: root mean square of the residuals, V
-    :param thermal: whether the temperature of the model moves
-    :param constants: what the discharges say about each constant
-    :param discharges: the discharges
-    :param usual_start: how these start, which is full for this cell; ``None``: not alike, or in files of fits that were made
-        without it
-    :raises TypeError: for a value of another kind
+    :param thermal: whether the temperature of the model changes
+    :param constants: the result for each constant
+    :param discharges: the result for each discharge
+    :param usual_start: how the discharges start, which means full for this cell; ``None``: they start differently, or the file
+        of the fit has no start
+    :raises TypeError: for a value of another type
     :raises ValueError: for errors that are not positive, and numbers that are not finite
     """
 

@@ -15,7 +15,7 @@ from battery_env.estimators.verdict import Diagnosis, is_plausible
 
 class ClosedForm(Estimator):
     """
-    Both parameters from two consecutive full states, exactly; no learning can do more than tie with it.
+    Both parameters from two consecutive full states, exactly; learning can at most tie.
 
     Charge is conserved, so that the four charges always add up to what they are at full charge,
     ``q_mobile * (0.9 + 0.1 + 0.6 + 1/15) = q_mobile / 0.6``. And the ohmic voltage drop obeys

@@ -45,21 +45,21 @@ def fit_life(
       path = fit_life(load_nasa_discharges("B0006"))  # or fit_life([life_of_one, life_of_another])
       print(LeastSquares(path=path).estimate(load_nasa_discharges("B0005")[80].until(1500.0).loaded_part(2.7)))
 
-    First :func:`fit_cell` fits six ages of each life at once: what these do not determine together no single age does. Then
-    12 ages of each life, evenly spread, are fitted one by one, each with constants of its own under the priors of
-    ``fit_cell`` around the common ones. Ten seconds a life. Nothing but time, current and voltage is used.
+    First :func:`fit_cell` fits six ages of each life at once, because no single age determines more than all six together.
+    Then 12 ages of each life, evenly spread, are fitted one by one, each with constants of its own under the priors of
+    ``fit_cell`` around the common constants. This takes ten seconds a life, and uses only time, current and voltage.
 
-    Which part of the charge that can move lies beyond the cut-off no voltage shows, once the equilibrium voltage may be
-    another one. So ``q_mobile`` keeps the meaning that it has everywhere here: at each age it is that of
+    If the equilibrium voltage may change, no voltage shows which part of the charge that can move lies beyond the cut-off.
+    Therefore ``q_mobile`` keeps its meaning elsewhere in the package: at each age it is the ``q_mobile`` of
     :class:`~battery_env.LeastSquares` with the constants of ``start``, to 0.2 %.
 
-    :param discharges: of one cell, from the youngest to the oldest, each from full charge to the cut-off; or of several, one
-        sequence each
+    :param discharges: discharges of one cell, from the youngest to the oldest, each from full charge to the cut-off; or one
+        such sequence for each of several cells
     :param cut_off_V: cut-off voltage, V
-    :param start: what is thought of the constants before, as of :func:`fit_cell`
+    :param start: the constants before the fit, as in :func:`fit_cell`
     :param limit_V: the largest root mean square of the residuals of a single age, V
     :return: the path
-    :raises TypeError: for what is no sequence of records
+    :raises TypeError: if ``discharges`` is no sequence of records
     :raises ValueError: for less than two discharges of a cell, records that cannot be used, or cells that the equations cannot
         describe
     """

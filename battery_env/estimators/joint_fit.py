@@ -75,37 +75,37 @@ def fit_cell(
     limit_V: float = LIMIT_V,
 ) -> CellFit:
     """
-    Fit the constants of the model to a cell of your own: how fast it follows its load (``kn``, ``kp``, ``tDiffusion``,
-    ``to``, ``tsn``, ``tsp``) and its equilibrium voltage (``U0p``, ``Ap``), to a few of its discharges at once, each with a
-    ``q_mobile`` and ``r_o`` of its own. Three discharges suffice; take them from all ages, and at all loads, that the
-    constants are to hold for. Each must start with a full cell, and reach the cut-off: one in progress is refused.
+    Fit the constants of the model to a few discharges of your own cell: how fast the cell follows its load (``kn``, ``kp``,
+    ``tDiffusion``, ``to``, ``tsn``, ``tsp``) and its equilibrium voltage (``U0p``, ``Ap``). Each discharge has its own
+    ``q_mobile`` and ``r_o``. Three discharges are enough; take discharges of all ages and loads for which you will use the
+    constants. Each must start with a full cell and reach the cut-off: a discharge in progress is refused.
 
-    *What is minimized* is the sum of squares of the residuals of the voltage and of the distances to the priors: logarithms
-    of the rate constants have ``RATE_PRIOR_SD``, and the change of the equilibrium voltage is a polynomial in the mole
-    fraction of the positive electrode with ``EQUILIBRIUM_PRIOR_SD_V``, which ``U0p`` and ``Ap`` can make exactly. So constants
-    that the discharges do not determine stay near what they were. The voltage at rest of a full cell counts as much as all
-    that follows within a fiftieth of the discharge. The search is scipy's trust region with exact derivatives.
+    *Objective.* The fit minimizes the sum of squares of the residuals of the voltage and of the distances to the priors. The
+    logarithms of the rate constants have ``RATE_PRIOR_SD``. The change of the equilibrium voltage is a polynomial in the mole
+    fraction of the positive electrode with ``EQUILIBRIUM_PRIOR_SD_V``, which ``U0p`` and ``Ap`` represent exactly. Therefore
+    constants that the discharges do not determine stay near their start. The voltage at rest of a full cell counts as much as
+    all samples within a fiftieth of the discharge. The search is scipy's trust region with exact derivatives.
 
-    *How sure it is.* The residuals are the error of the model, and drift slowly: those of a discharge count as 50 independent
-    ones, or as many as they change their sign. Their variance is found along with the constants.
+    *Uncertainty.* The residuals are the error of the model, and drift slowly: the residuals of a discharge count as 50
+    independent ones, or as many as their changes of sign. The fit estimates their variance together with the constants.
 
-    *The error to expect* of another discharge, ``mismatch_V``, is what discharges show that are left out of the fit: the
-    young, the middle and the old third, one after the other. What none shows, of a life (:data:`LIFE_LOSS` of ``q_mobile``)
-    and of ``q_mobile`` itself, counts in proportion to the error of constants that were not fitted.
+    *The expected error* of another discharge, ``mismatch_V``, is the error of discharges left out of the fit: the young, the
+    middle and the old third, one after the other. The part of a life (:data:`LIFE_LOSS` of ``q_mobile``) and of ``q_mobile``
+    that no discharge covers counts in proportion to the error of the constants before the fit.
 
-    *Other cells.* A cell of another capacity starts with electrodes of another size. Another chemistry works as far as the
-    equations bend; where they do not, the residuals stay large and the fit is refused. A start that is not full is taken for
-    that of another chemistry: a fit whose full cell rests more than 0.04 V below that of ``start`` warns of it (``doubt``). So
-    does a fit of less than half a life, and one that a discharge does not belong to.
+    *Other cells.* A cell of another capacity starts with electrodes of another size. For another chemistry the fit is as good
+    as the equations; if the residuals stay large, the fit is refused. A start that is not full looks like another chemistry:
+    a fit whose full cell rests more than 0.04 V below the full cell of ``start`` has a warning (``doubt``). A fit of less than
+    half a life, and a fit with a discharge that does not belong to the others, have a warning, too.
 
-    :param discharges: of one cell, each from full charge. Of a :class:`~battery_env.Discharge` the part from load-on to the
-        cut-off is taken; other records are taken whole
+    :param discharges: discharges of one cell, each from full charge. A :class:`~battery_env.Discharge` counts from load-on to
+        the cut-off, and other records count whole
     :param cut_off_V: cut-off voltage, V
-    :param start: what is thought of the constants before; ``None``: the new cell's, at the size of this one
-    :param thermal: whether the temperature of the model moves. It starts at the measured one, if that is known
+    :param start: the constants before the fit; ``None``: the new cell's, at the size of this cell
+    :param thermal: whether the temperature of the model changes. It starts at the measured temperature, if known
     :param dt_s: time step of the model, s
     :param limit_V: the largest root mean square of the residuals, V
-    :raises TypeError: for what is no sequence of records
+    :raises TypeError: if ``discharges`` is no sequence of records
     :raises ValueError: for an argument out of range, records that cannot be used or stay more than 0.05 V above the cut-off,
         or a cell that the equations cannot describe
     """

@@ -99,63 +99,63 @@ class _Resistance(NamedTuple):
 
 class LeastSquares(Estimator):
     """
-    The (q_mobile, r_o) whose simulated voltage is closest to the recorded one, over all samples of the record.
+    The (q_mobile, r_o) whose simulated voltage is closest to the recorded voltage, over all samples of the record.
 
-    The defaults are those of simulated records. For recorded cells take :func:`battery_env.calibrate`, or
-    ``battery_env.Settings().calibrator()``: a model of the temperature, and the errors of model and sensor to expect.
+    The defaults are for simulated records. For recorded cells use :func:`battery_env.calibrate`, or
+    ``battery_env.Settings().calibrator()``, with a model of the temperature and the expected errors of model and sensor.
 
-    The model starts at the first sample of the record, fully charged and at rest unless ``initial_soc`` or ``initial`` say
-    otherwise, and follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge give
+    The model starts at the first sample of the record, fully charged and at rest (or with ``initial_soc`` or ``initial``), and
+    follows the recorded current (:func:`battery_env.records.resample_current`). For a recorded discharge pass
     :meth:`battery_env.Discharge.loaded_part`, which starts when the load is switched on.
 
-    *The search.* At a fixed current the charges of the model are linear in ``q_mobile``; so one simulation gives exactly the
-    value below which the model cell would be empty before the record ends. The search is over the logarithm of the distance
-    to it, in which the knee of a discharge is nearly straight. It is Levenberg-Marquardt's (MINPACK's) with exact derivatives,
-    from the best of several starts on a coarse grid of time. A parameter that leaves its bounds is held there.
+    *Search.* At a fixed current the charges of the model are linear in ``q_mobile``. Therefore one simulation gives exactly
+    the value below which the model cell would be empty before the end of the record. The search is over the logarithm of the
+    distance to this value, because the knee of a discharge is nearly straight in it. The method is Levenberg-Marquardt
+    (MINPACK) with exact derivatives, from the best of several starts on a coarse time grid. Parameters stay within bounds.
 
     *Standard deviations* follow from one likelihood (:mod:`~battery_env.estimators.error`). With ``mismatch_V`` of 0 the
-    residuals are white, as of simulated records with noise. On a real cell they are the model's error, which a fit of half a
-    discharge hides in its parameters. So an error of twice ``mismatch_V``, the error expected of the model, drifts along the
-    charge drawn, beside white noise. More samples do not average it out. That of ``q_mobile`` is as wide as the likelihood,
-    and not as its curvature: where a knee begins a much larger ``q_mobile`` is hardly less likely.
+    residuals are white, as in simulated records with noise. The residuals of a real cell are the model's error, and a fit of
+    half a discharge hides this error in the parameters. Therefore an error of twice ``mismatch_V`` drifts along the charge
+    drawn, in addition to white noise. More samples do not average the drift out. The standard deviation of ``q_mobile`` has
+    the width of the likelihood, not of its curvature: at the start of a knee a much larger ``q_mobile`` is hardly less likely.
 
-    *Nuisance constants* are not known exactly, and are estimated along with the parameters, each under a prior of its own; so
-    can be an offset of the voltage sensor. Slow diffusion looks like a smaller ``q_mobile``, and slow kinetics like a larger
-    ``r_o``: what the record does not tell apart is in the standard deviations of the parameters.
+    *Nuisance constants* are not known exactly. The fit estimates these constants together with the parameters, each under a
+    prior, and also an offset of the voltage sensor. Slow diffusion looks like a smaller ``q_mobile``, and slow kinetics like a
+    larger ``r_o``: the standard deviations contain all that the record does not separate.
 
     *Settled* (:class:`~battery_env.Estimate`) means that the record alone determines every parameter searched for, with a
     standard deviation below :data:`~battery_env.estimates.findings.SETTLED_SHARES` of its value without any prior, and that
-    nothing contradicts it: the start, gaps and steps of the voltage, its fit, bounds, and a prior. An estimate that rests on a
-    prior is not settled: it is as good as the prior.
+    nothing contradicts the estimate: the start, gaps and steps of the voltage, the fit, bounds, and a prior. An estimate that
+    depends on a prior is not settled, because it is only as good as the prior.
 
-    *During a discharge*, :meth:`trace` with ``window_every_s`` estimates again and again from all samples so far. Before its
-    knee a discharge says little about ``q_mobile``: carry (mean, standard deviation) over from an earlier one as
-    ``prior_q_mobile_C``; it enters as one more residual.
+    *During a discharge*, :meth:`trace` with ``window_every_s`` repeats the estimate from all samples so far. Before the knee a
+    discharge says little about ``q_mobile``: pass (mean, standard deviation) of an earlier discharge as ``prior_q_mobile_C``,
+    which enters as one more residual.
 
-    :param parameters: which to search for; the other is held at ``cell``'s value
+    :param parameters: the parameters to search for; the other is held at the value of ``cell``
     :param cell: constants of the model; ``None``: the new cell's
-    :param thermal: whether the temperature of the model moves
-    :param dt_s: time step of the model, s; that of simulated records if these are to be reproduced exactly
+    :param thermal: whether the temperature of the model changes
+    :param dt_s: time step of the model, s; the time step of simulated records reproduces these records exactly
     :param initial: state of the model at the first sample, shape (8,), e.g. from a simulation. It stands for a history
-        of the current: its charges move along with ``q_mobile``. ``None``: at rest, with ``initial_soc``
-    :param q_mobile_bounds_C: where to search, C; the lower one is raised to the least value that the record allows
-    :param r_o_bounds_ohm: where to search, ohm
-    :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before this record, C; ``None``: nothing is known
-    :param usual_q_mobile_C: about what cells of this size hold, new or worn, C: a weak prior that nobody stated, so that no
-        settled estimate rests on it, and nothing contradicts it; ``None``: any size is as likely
-    :param mismatch_V: error to expect of the model itself, V, as above
-    :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: as the record shows it
+        of the current: its charges change in proportion to ``q_mobile``. ``None``: at rest, with ``initial_soc``
+    :param q_mobile_bounds_C: bounds of the search, C; the lower bound is raised to the least value that the record allows
+    :param r_o_bounds_ohm: bounds of the search, ohm
+    :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before this record, C; ``None``: no prior
+    :param usual_q_mobile_C: usual ``q_mobile`` of cells of this size, new or aged, C: a weak prior that nobody stated. No
+        settled estimate depends on it, and nothing contradicts it; ``None``: all sizes are equally likely
+    :param mismatch_V: expected error of the model, V, as above
+    :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: estimated from the record
     :param window_every_s: time between the estimates of :meth:`trace`, s; ``None``: one estimate, at the end
-    :param current_gain_sd: standard deviation of the gain of the current sensor, a share of it; no voltage shows it
-    :param nuisance: what else is not known: standard deviations of the logarithms of constants, by name, e.g.
-        ``{"kn": 0.2, "tDiffusion": 0.2}`` for two that are known to 20 %; and of the offset of the sensor in V, as
+    :param current_gain_sd: relative standard deviation of the gain of the current sensor; the voltage does not show the gain
+    :param nuisance: other unknowns: standard deviations of the logarithms of constants, by name, e.g.
+        ``{"kn": 0.2, "tDiffusion": 0.2}`` for two constants known to 20 %; and of the offset of the sensor in V, as
         ``"offset_V"``
     :param initial_soc: state of charge at the first sample, after a rest: a number, or (mean, standard deviation), which adds
-        to those of the parameters. :func:`battery_env.soc_from_rest` tells it from the voltage of the rest before the load
-    :param path: how cells of this kind age (:func:`battery_env.fit_life`): which constants, ``q_mobile`` and ``r_o`` go
-        together before this record is seen. ``cell`` and ``mismatch_V`` are those of the path by default
-    :param usual_start: how other discharges of the cell start, which the record is compared with; ``None``: as a full cell of
-        the model rests
+        to the parameters' own. :func:`battery_env.soc_from_rest` computes it from the voltage of the rest before the load
+    :param path: path of aging cells of this kind (:func:`battery_env.fit_life`): constants, ``q_mobile`` and ``r_o`` that go
+        together before the record is known. The path gives the defaults of ``cell`` and ``mismatch_V``
+    :param usual_start: how other discharges of the cell start, to compare the record with; ``None``: a full cell of the model
+        at rest
     :raises ValueError: for an argument out of range
     """
 

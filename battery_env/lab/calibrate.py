@@ -79,25 +79,25 @@ def calibrate(
     source: Discharge | pd.DataFrame | str | Path, settings: Settings | None = None, **options: Any
 ) -> Calibration | list[Calibration]:
     """
-    Calibrate the model to recorded discharges, as the command line does.
+    Calibrate the model to recorded discharges, like the command ``battery-calibrate``.
 
     .. code-block:: python
 
       for found in battery_env.calibrate("life.csv", nominal_Ah=2.0):
           print(found)
 
-    Where the start of a discharge is not known, or the voltage before the load contradicts it, where a sensor fails, or where
-    nothing was drawn though the samples beside say so, its capacity is not known either. Its surroundings, and its temperature
-    at the start, are those measured at load-on.
+    The capacity is unknown if the start of a discharge is unknown or contradicted by the voltage before the load, if a sensor
+    fails, or if no charge was drawn although the samples around say so. The model's surroundings and first temperature are
+    the temperature measured at the start of the load.
 
-    :param source: one discharge, whole or in progress; a table or a file of them, see :func:`battery_env.read_discharges`; or
-        what the command takes: a folder, ``"life.csv:2"``, or a bundled cell, as ``"B0005:100"``
-    :param settings: how to look at them; ``None``: as ``options`` say
-    :param options: of :class:`Settings`, by name: ``cut_off_V``, ``nominal_Ah``, ``initial_soc``, ``cell``, ...; of tables and
-        files what ``read_discharges`` takes, too
-    :return: what a discharge says; of other sources a list, without what cannot be used, of which warnings say why
-    :raises ValueError: if none can be used
-    :raises TypeError: for an option that there is not
+    :param source: one discharge, whole or in progress; a table or a file of discharges, see
+        :func:`battery_env.read_discharges`; or a folder, ``"life.csv:2"``, or a bundled cell, such as ``"B0005:100"``
+    :param settings: how to calibrate; ``None``: only ``options``
+    :param options: options of :class:`Settings`, by name: ``cut_off_V``, ``nominal_Ah``, ``initial_soc``, ``cell``, ...; for
+        tables and files also the options of ``read_discharges``
+    :return: the calibration of a discharge; for other sources a list without unusable discharges, which warnings name
+    :raises ValueError: if no discharge can be used
+    :raises TypeError: for an unknown option
     """
     known = (SettingsOptions if isinstance(source, Discharge) else Options).__annotations__
     for name in options.keys() - known.keys():

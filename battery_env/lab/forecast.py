@@ -39,24 +39,24 @@ _LONGEST_SHOWN = 1.5
 @dataclass(frozen=True, eq=False)
 class Forecast:
     """
-    What :func:`forecast` expects of a discharge in progress: n samples of what may come, all equally likely.
+    The future of a discharge in progress, from :func:`forecast`: n equally likely samples.
 
     :param record: the discharge so far
     :param load_name: the load to come, in words
-    :param cut_off_V: where the discharge ends, V
-    :param eod_time_s: end of discharge, on the clock of the record, s, shape (n,); infinite where it is not reached
+    :param cut_off_V: voltage at the end of the discharge, V
+    :param eod_time_s: end of discharge, on the clock of the record, s, shape (n,); infinite if not reached
     :param soc: state of charge at the end of the record: the share of ``q_mobile`` left in the negative electrode, shape (n,)
     :param q_mobile: charge that can move, C, shape (n,)
-    :param resistance_10s_ohm: the resistance after ten seconds, as of the estimate, ohm, shape (n,); NaN if it states none
+    :param resistance_10s_ohm: the resistance after ten seconds of the estimate, ohm, shape (n,); NaN if not estimated
     :param r_o: ohmic resistance of the model, ohm, shape (n,)
-    :param capacity_Ah: charge given from full to the end of discharge, which is the capacity at this load, Ah, shape (n,).
-        Where the record starts partly charged (``initial_soc`` of the model), what was missing then is added; NaN where the
-        end is not reached
+    :param capacity_Ah: charge from full to the end of discharge, the capacity at this load, Ah, shape (n,). If the record
+        starts partly charged (``initial_soc`` of the model), the capacity includes the missing charge; NaN if the end is not
+        reached
     :param nominal_Ah: capacity of the cell when new, Ah
-    :param time_s: from the end of the record on, on its clock, s, shape (K,)
-    :param voltage_V: quantiles :data:`BAND` of the voltage then, V, shape (3, K); a discharge that has ended counts as at
+    :param time_s: times from the end of the record on, on the clock of the record, s, shape (K,)
+    :param voltage_V: quantiles :data:`BAND` of the voltage at these times, V, shape (3, K); an ended discharge counts as at
         the cut-off
-    :param notes: what a reader should know of this forecast, sentences
+    :param notes: cautions about this forecast, sentences
     """
 
     record: Samples
@@ -165,38 +165,37 @@ def forecast(
     seed: int = 0,
 ) -> Forecast:
     """
-    The end of a discharge in progress, under a load to come, with what is not known of it.
+    Forecast the end of a discharge in progress, under a load to come, with its uncertainty.
 
-    Each sample is a cell with its own parameters, its own error of the model, and its own load if that is random. All follow
-    the record and then the load, down to the cut-off, for a week at most.
+    Each sample is a cell with parameters, a model error and (if the load is random) a load of its own. All samples follow the
+    record and then the load, down to the cut-off, for a week at most.
 
-    *Parameters* are drawn from the estimate and its standard deviations: ``q_mobile`` log-normal, half of it below the
-    estimate, and above what the record has already taken out of the cell; ``r_o`` normal, with the correlation that the
-    voltage of this record gives it with ``q_mobile``. Standard deviations of NaN count as zero, and ``notes`` say so.
+    *Parameters* are drawn from the estimate and its standard deviations. ``q_mobile`` is log-normal, half of it below the
+    estimate, and above the charge already drawn. ``r_o`` is normal, with the correlation with ``q_mobile`` that the voltage
+    of this record implies. Standard deviations of NaN count as zero, and ``notes`` say so.
 
-    *The error of the model* has the standard deviation ``mismatch_V``. Shortly before the end of the record it is the mean
-    difference between measured voltage and that of the sample, so that samples of any resistance agree with what was
-    measured. From there it drifts with the charge that is drawn. Samples that would have reached the cut-off within the
-    record are replaced by others.
+    *The error of the model* has the standard deviation ``mismatch_V``. Shortly before the end of the record the error is the
+    mean difference between measured and modelled voltage, so that samples of any resistance agree with the measurement.
+    Then the error drifts with the charge drawn. Samples that would have reached the cut-off within the record are replaced.
 
-    *The load.* Without ``load`` the discharge goes on as before: at its last current if that was constant (none, if it was
-    switched off), and otherwise in blocks of the record (:class:`battery_env.loads.BlockBootstrap`), of its current or of its
+    *The load.* Without ``load`` the discharge continues: at its last current if the current was constant (at rest if the load
+    was switched off), and otherwise in blocks of the record (:class:`battery_env.loads.BlockBootstrap`), of current or of
     power, whichever is steadier between the switches of the load.
 
     :param record: one discharge from its first sample to now, of a cell that was full unless ``model`` says otherwise
-    :param estimate: of any calibrator, best with its standard deviations
-    :param load: from the end of the record on: a number; a profile, ``Load(time_s, value, unit)``; a ``Cycle``; a function
-        of time in s that takes an array; or a ``RandomLoad``, of which each sample draws its own. ``None``: as above. Over
-        each time step of the model the mean of the load flows, and of a function its value at the start of the step
+    :param estimate: the estimate of any calibrator, best with standard deviations
+    :param load: the load from the end of the record on: a number; a profile, ``Load(time_s, value, unit)``; a ``Cycle``; a
+        function of time in s that takes an array; or a ``RandomLoad``, drawn anew for each sample. ``None``: as above. In
+        each time step of the model the mean of the load flows; a function counts with its value at the start of the step
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: the ``VEOD`` of the model's cell, 2.7 V if no
         ``model`` is given
-    :param load_unit: of a number or a function: ``"power"`` in W or ``"current"`` in A. Other loads have their own
-    :param model: the model that the estimate belongs to, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
-    :param mismatch_V: error to expect of the model, V; 0.05 V suits the bundled real cells, 0 simulated ones without mismatch
-    :param nominal_Ah: capacity that counts as a state of health of 1, Ah; ``None``: the charge that the model's cell, with
-        its own ``q_mobile`` and ``r_o``, gives from full under the load to come, on average where that is random
-    :param samples: how many
-    :param seed: seed of all that is drawn
+    :param load_unit: unit of a number or a function: ``"power"`` in W or ``"current"`` in A. Other loads have a unit
+    :param model: the model of the estimate, ``LeastSquares(...).model``; ``None``: ``RecordModel()``
+    :param mismatch_V: expected error of the model, V; 0.05 V suits the bundled real cells, 0 simulated cells without mismatch
+    :param nominal_Ah: capacity at a state of health of 1, Ah; ``None``: the charge that the model's cell, with its own
+        ``q_mobile`` and ``r_o``, gives from full under the load to come, on average if the load is random
+    :param samples: number of samples
+    :param seed: seed of all random draws
     :return: the samples, with quantiles, a summary and a plot
     :raises TypeError: for a load of another type
     :raises ValueError: for an argument out of range, an estimate that the record contradicts, or a load that charges the cell

@@ -45,24 +45,24 @@ _LIVES, _MOST = 2000, 2000
 @dataclass(frozen=True, eq=False)
 class Life:
     """
-    What :func:`track_life` found.
+    The life of a cell, from :func:`track_life`.
 
-    The logarithm of ``q_mobile`` is a random walk with drift over the discharges, of which each estimate is one reading. Where
-    their numbers leave discharges out, the walk goes on through these.
+    The logarithm of ``q_mobile`` is a random walk with drift over the discharges, and each estimate is a noisy observation.
+    If the numbers leave discharges out, the walk continues through these discharges.
 
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
-        ``resistance_10s_ohm`` and ``sd_resistance_10s_ohm`` (after ten seconds, of a fit with constants that are not held),
+        ``resistance_10s_ohm`` and ``sd_resistance_10s_ohm`` (after ten seconds, of a fit that also estimates constants),
         ``settled_resistance_10s``, ``measured_resistance_10s_ohm``, ``r_o_ohm``, ``settled``, ``findings``, ``reason``,
         ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off), ``mean_current_A``, ``lasted_share`` (its
-        duration, as a share of the model's at this ``q_mobile``; NaN if it was cut short), and what the discharges before let
-        expect of ``q_mobile``, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
+        duration, as a share of the model's at this ``q_mobile``; NaN if it was cut short), and the prediction from the earlier
+        discharges, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
-    :param noise_share: standard deviation of an estimate beside the others, likewise
-    :param drift_share: mean step
+    :param noise_share: standard deviation of the error that an estimate does not share with the others, as such a share
+    :param drift_share: mean step, as such a share
     :param state: mean of (ln ``q_mobile`` after the last discharge, drift), shape (2,)
-    :param covariance: theirs, shape (2, 2)
-    :param sd_share: standard deviation of the last valid ``q_mobile``, a share, with constants as unsure as they are; or NaN
-    :param usual_start: how the discharges start; ``None`` where they do not start and last alike
+    :param covariance: covariance of ``state``, shape (2, 2)
+    :param sd_share: relative standard deviation of the last valid ``q_mobile`` with uncertain constants; or NaN
+    :param usual_start: how the discharges start; ``None`` if they do not start and last alike
     """
 
     table: pd.DataFrame
@@ -77,9 +77,9 @@ class Life:
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
         """
-        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. It is for the load
-        of the life, under which the error that all estimates share cancels from the end. At the ``q_mobile`` of a whole
-        discharge the model ends a little early or late, about as much as in the one before: the mean allows for it.
+        Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. The prior is for
+        the load of the life, because there the shared error of all estimates cancels from the end. At the ``q_mobile`` of a
+        whole discharge the model ends a little early or late, as in the discharge before: the mean corrects for this error.
         """
         return self._prior_C(1)
 
@@ -185,9 +185,9 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     filtered by Kalman's recursions. The sizes of step and noise are those that make the series most probable, under weak
     priors (:data:`PRIOR_STEP_SHARE`).
 
-    A discharge is *valid* if its estimate is settled, or only imprecise though it reaches the cut-off: discharges of one
-    cell share that error, so that it hides no step. Others are left out: those that cannot be used, that something in the
-    record contradicts, or that were cut short.
+    A discharge is *valid* if its estimate is settled, or reaches the cut-off and is only imprecise: discharges of one cell
+    share this error, so that the error hides no step. Unusable discharges, discharges that their record contradicts, and
+    discharges that were cut short are left out.
 
     .. code-block:: python
 
@@ -195,10 +195,10 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
       next_fit = Settings(prior_q_mobile_C=life.prior_q_mobile_C).calibrator()
       print(life.remaining_discharges(threshold_Ah=1.4))
 
-    :param discharges: of one cell, in their order
-    :param cut_off_V: where they end, V
-    :param calibrator: without a prior, as ``Settings(cell=fit).calibrator()`` is. All discharges have the same constants; how
-        unsure these are counts at other loads. ``None``: least squares with the constants of a new 18650
+    :param discharges: discharges of one cell, in their order
+    :param cut_off_V: voltage at which the discharges end, V
+    :param calibrator: least squares without a prior, such as ``Settings(cell=fit).calibrator()``. All discharges have the same
+        constants, whose uncertainty counts at other loads. ``None``: least squares with the constants of a new 18650
     :raises ValueError: if no discharge is valid, or the calibrator has a prior or no full cell at the start
     """
     if calibrator is None:

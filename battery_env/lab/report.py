@@ -31,13 +31,13 @@ def quantity(text: str = "", unit: str = "", digits: int = 0, scale: float = 1.0
 @dataclass(frozen=True, repr=False)
 class Calibration:
     """
-    What a discharge says. ``print`` shows it, :meth:`row` gives its columns, and a table of many is
-    ``pd.DataFrame(each.row() for each in found)``. Names of columns end with units; NaN stands for what is not known.
+    The calibration of a discharge. ``print`` shows the numbers, :meth:`row` returns the columns by name, and
+    ``pd.DataFrame(each.row() for each in calibrations)`` is a table. Names of columns end with units; NaN means unknown.
 
-    :param settings: how it was looked at
-    :param record: what was looked at; ``None`` where only the columns are kept
-    :param forecast: the voltage of the model at the estimate; likewise
-    :param end: what may come after a record in progress; likewise, and of others ``None``
+    :param settings: the settings of this calibration
+    :param record: the calibrated record; ``None`` if only the columns are kept
+    :param forecast: the voltage of the model at the estimate; ``None`` if only the columns are kept
+    :param end: the forecast for a record in progress; otherwise, or if only the columns are kept, ``None``
     """
 
     settings: Settings = field(compare=False)
@@ -89,16 +89,16 @@ class Calibration:
 
     @property
     def reason(self) -> str:
-        """The findings as one text, which says what to do."""
+        """The findings as one text, with remedies."""
         return reason_of(self.findings)
 
     def row(self) -> dict[str, Any]:
-        """The columns by name; each finding is a dictionary, and at last is what they say."""
+        """Return the columns by name: each finding as a dictionary, and the reason as the last column."""
         columns = {name: getattr(self, name) for name in _HOW}
         return columns | {"findings": [asdict(each) for each in self.findings], "reason": self.reason}
 
     def shown(self, name: str, digits: int | None = None, with_unit: bool = True) -> str:
-        """A column for readers."""
+        """Return a column as text for readers."""
         value, how = getattr(self, name), _HOW[name]
         if isinstance(value, bool):
             return "yes" if value else "no"

@@ -51,7 +51,7 @@ class SettingsOptions(TypedDict, total=False):
 
 
 class ResolvedSettings(NamedTuple):
-    """What the cell tells of :class:`Settings` where nothing is stated: the names are theirs."""
+    """:class:`Settings` without ``None``: the cell gives what nobody stated."""
 
     cut_off_V: float
     mismatch_V: float
@@ -62,31 +62,31 @@ class ResolvedSettings(NamedTuple):
 @dataclass(frozen=True)
 class Settings:
     """
-    How a discharge of a real cell is looked at. ``Settings().calibrator()`` is least squares, with what such a cell needs.
-    What is not stated stays ``None``, so that it follows another ``cell``; :attr:`resolved` has the numbers.
+    Set how to calibrate discharges of a real cell. ``Settings().calibrator()`` is least squares with settings for such cells.
+    An option that nobody stated stays ``None`` and follows ``cell``; :attr:`resolved` has the numbers.
 
-    :param method: of calibration; ``None``: least squares. ``"policy"`` is the one that comes with the package, for both
+    :param method: method of calibration; ``None``: least squares. ``"policy"`` is the policy of the package, for both
         parameters; its model is a new 18650 at constant temperature
-    :param cut_off_V: voltage at which the discharge ends, V; ``None``: where that of the fit of ``cell`` does, or 2.7
-    :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: nothing is known
-    :param mismatch_V: error to expect of the model itself, V; ``None``: that of the fit of ``cell``, or 0.05
-    :param current_gain_sd: standard deviation of the gain of the current sensor, as a share of it
-    :param thermal: whether the temperature of the model moves; ``None``: as in the fit of ``cell``, or that it does
-    :param nominal_Ah: nominal capacity, which the state of health refers to, Ah; ``None``: the charge that ``cell``, with its
-        own ``q_mobile`` and ``r_o``, gives from full at the current of the discharge, or not known if there is no ``cell``.
-        Where nothing else is known, it tells the ``q_mobile`` of a cell of another size than a new 18650, in progress
-    :param cell: constants of the model, or all that ``fit_cell`` found: beyond the loads of the fit by more than a quarter no
-        estimate is settled, and no nominal capacity is told. Or how cells of its kind age, as ``fit_life`` found it, which is
-        for least squares. ``None``: the constants of a new 18650
-    :param cell_rates_sd: how well the rate constants of ``cell`` are known: standard deviations of their logarithms, by name,
-        for least squares. ``None``: those of the fit; those of a new 18650 as any cell of any kind may differ from them
-        (:data:`battery_env.estimators.cell_fit.RATE_PRIOR_SD`), and stated ones as cells of a kind do
+    :param cut_off_V: voltage at which the discharge ends, V; ``None``: the cut-off of the fit of ``cell``, or 2.7
+    :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: no prior
+    :param mismatch_V: expected error of the model, V; ``None``: the error of the fit of ``cell``, or 0.05
+    :param current_gain_sd: standard deviation of the gain of the current sensor, relative
+    :param thermal: whether the temperature of the model changes; ``None``: as in the fit of ``cell``, or true
+    :param nominal_Ah: nominal capacity for the state of health, Ah; ``None``: the charge that ``cell`` with its own
+        ``q_mobile`` and ``r_o`` gives from full at the current of the discharge, or unknown without a ``cell``. Without other
+        prior knowledge the nominal capacity is also the expected size of a cell in progress, instead of a new 18650
+    :param cell: constants of the model, or a result of ``fit_cell``: more than a quarter beyond the loads of the fit no
+        estimate is settled, and the nominal capacity is unknown. Or a result of ``fit_life``, the path of aging cells of this
+        kind, for least squares. ``None``: the constants of a new 18650
+    :param cell_rates_sd: uncertainty of the rate constants of ``cell``: standard deviations of their logarithms, by name, for
+        least squares. ``None``: for a fit its own; for a new 18650 the spread of cells of any kind
+        (:data:`battery_env.estimators.cell_fit.RATE_PRIOR_SD`), and for stated constants the spread of cells of one kind
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
-        ``"rest"``: told from the voltage of the rest before the load, of a minute at least
-    :param usual_start: how discharges of this cell start, as ``Life.usual_start`` of its life tells: a start like theirs is
-        full; ``None``: as those of the fit of ``cell`` do, or as a full cell of the model rests
-    :raises ValueError: for an argument out of range, and for what a policy cannot be told. What the calibrators refuse they
-        refuse when :meth:`calibrator` makes them
+        ``"rest"``: computed from the voltage of at least a minute of rest before the load
+    :param usual_start: how discharges of this cell start, such as ``Life.usual_start``: a start like this is full; ``None``:
+        the start of the fit of ``cell``, or a full cell of the model at rest
+    :raises ValueError: for an argument out of range, and for options that a policy does not take. :meth:`calibrator` raises
+        the errors of the calibrators
     """
 
     method: Method | None = None

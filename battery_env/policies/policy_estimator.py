@@ -88,19 +88,20 @@ class PolicyEstimator(OnlineEstimator):
     - A policy of a voltage-only environment starts with the estimate of a new cell, and moves it every ``decision_s``. It
       takes any record that starts fully charged, simulated or recorded, or a stream (:meth:`update`).
 
-    A policy states standard deviations if its observation has a fit (options ``nuisance`` and ``path``): those of the fit
-    under its priors, with the distance of the estimate from it. It has settled if they are as small as least squares ask for,
-    the fit explains the record, and nothing in the record contradicts it. Other policies state none, and never settle.
+    A policy states standard deviations if its observation has a fit (options ``nuisance`` and ``path``): the fit's under its
+    priors, widened by the distance of the estimate from the fit. The estimate is settled if the standard deviations are as
+    small as for least squares, the fit explains the record, and nothing in the record contradicts the estimate. Other policies
+    state no standard deviations, and never settle.
 
-    What :meth:`save` wrote is refused with another :class:`~battery_env.OnnxPolicy`; models of
-    Stable-Baselines3 are not told from each other.
+    :meth:`load` refuses a file from another :class:`~battery_env.OnnxPolicy`, but cannot distinguish models of
+    Stable-Baselines3.
 
-    :param policy: what to ask for actions, deterministically
+    :param policy: the policy, asked for deterministic actions
     :param env_id: id of the environment that the policy was trained on
     :param decision_s: time between two estimates of a voltage-only policy, s
-    :param options: of its task, but for its data and the length of its episodes; ``cell`` among them, the constants that a
-        voltage-only policy was trained with, if not the new cell's
-    :raises ValueError: if the id is not one of a calibration environment
+    :param options: options of the task except data and length of episodes; also ``cell``, the constants in the training of a
+        voltage-only policy, if not the new cell's
+    :raises ValueError: if the id is not a calibration environment
     """
 
     def __init__(self, policy: Predictor, env_id: str, decision_s: float = 60.0, **options: Any) -> None:

@@ -63,19 +63,19 @@ _FEW_SAMPLES = 3
 @dataclass(frozen=True, eq=False)
 class Discharge:
     """
-    One recorded discharge of one cell; it checks itself when it is made, and its arrays cannot be written to.
+    One recorded discharge of one cell, checked on construction, with read-only arrays.
 
     :param time_s: times of the samples, strictly increasing, s, shape (T,)
     :param voltage_V: terminal voltage, V, shape (T,)
     :param current_A: current, positive in discharge, A, shape (T,)
-    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if it was not measured. No model reads it but
-        for its first value, which :func:`battery_env.calibrate` takes for that of the surroundings: ``LeastSquares`` makes its
-        own from there, and the model of ``PolicyEstimator`` is isothermal
-    :param meta: what else is known, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
-    :param starts_at_rest: whether the first voltage is that of the cell at rest, and the first current that of the load
-        that is switched on then, as in a :meth:`loaded_part`. Calibrators judge by it whether the cell was full
-    :param history: what else is known of its charge: the charge before, which says whether the cell was full
-    :raises ValueError: for arrays that do not fit together, or invalid values; it says what to do
+    :param temperature_C: temperature of the cell, degC, shape (T,); ``None`` if not measured. Models read only the first
+        value, and :func:`battery_env.calibrate` takes this value for the surroundings: ``LeastSquares`` computes its own
+        temperature from there, and the model of ``PolicyEstimator`` is isothermal
+    :param meta: other data, e.g. ``cell``, ``cycle``, ``capacity_Ah``, ``start_time``, ``source``
+    :param starts_at_rest: whether the first voltage is the voltage at rest, and the first current the current of the load
+        that is then switched on, as in a :meth:`loaded_part`. Calibrators use this voltage to check whether the cell was full
+    :param history: the history of the charge: the charge before shows whether the cell was full
+    :raises ValueError: for arrays of different shapes, or invalid values; the message says what to do
     """
 
     time_s: FloatArray
@@ -349,9 +349,9 @@ def load_nasa_discharges(cell: str) -> list[Discharge]:
     ``ambient_temperature_C``, ``capacity_Ah`` (charge to 2.7 V), ``Re_ohm`` and ``Rct_ohm`` (of the impedance test nearest in
     time) and ``test_id`` (position among all tests of the cell).
 
-    :param cell: one that comes with the package (``BUNDLED_CELLS``). NASA's own files of others, such as ``B0018.mat``, are
-        read by :func:`battery_env.read_discharges`
-    :return: one :class:`Discharge` each
+    :param cell: a cell of the package (``BUNDLED_CELLS``). For NASA's own files of other cells, such as ``B0018.mat``, use
+        :func:`battery_env.read_discharges`
+    :return: the discharges
     :raises FileNotFoundError: if there is no such cell
     """
     if cell not in BUNDLED_CELLS:

@@ -106,8 +106,8 @@ class Tangents(NamedTuple):
 
 class RecordModel:
     """
-    The model as it follows the current of a record: what calibration by the voltage of whole records rests on, and what the
-    estimate of any calibrator lets expect.
+    The model under the current of a record: the basis of calibration by the voltage of whole records, and of predictions from
+    the estimate of any calibrator.
 
     .. code-block:: python
 
@@ -119,7 +119,7 @@ class RecordModel:
     :param thermal: whether the temperature of the model moves
     :param dt_s: time step of the model, s
     :param initial: state of the model at the first sample, shape (8,). It stands for a history of the current: its charges
-        move along with ``q_mobile``. ``None``: at rest, with ``initial_soc``
+        change in proportion to ``q_mobile``. ``None``: at rest, with ``initial_soc``
     :param initial_soc: state of charge at the first sample, within 0 .. 1; 1: fully charged
     :raises ValueError: for an argument out of range, or both ``initial`` and an ``initial_soc``
     """

@@ -49,7 +49,7 @@ class CalibrationTask(ABC):
     All randomness of an episode is drawn when it starts, from the generator of its cell: the scalar environment is the batch
     of one, and a batch makes the same episodes as that many scalar environments.
 
-    What is registered is a class: its docstring is the page of its environments, and its keyword arguments are their options.
+    What is registered is a class: its keyword arguments are the options of its environments.
 
     :ivar parameters: what the action stands for, in its order
     :ivar cells: size of the batch

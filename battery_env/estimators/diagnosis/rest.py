@@ -74,7 +74,7 @@ def soc_from_rest(
     dt_s: float = 1.0,
 ) -> Start:
     """
-    Tell the state of charge that a record starts with from the voltage of the rest before its load, of a minute at least, by
+    Compute the state of charge at the start of a record from the voltage of at least a minute of rest before the load, with
     the open-circuit voltage of the model. A voltage that still relaxes widens the standard deviation.
 
     .. code-block:: python

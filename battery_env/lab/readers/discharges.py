@@ -58,15 +58,15 @@ def read_discharges(
     """
     Read the discharges of a file or of a table.
 
-    A table is a ``pandas.DataFrame``, whose index is a column too if it has a name. A file is text with a header (commas,
+    A table is a ``pandas.DataFrame``; an index with a name is a column, too. A file is text with a header (commas,
     semicolons, tabs or blanks, decimal points or commas, also packed as .gz or .zip), Parquet, one of NASA's .mat
     files, with the extra ``excel`` a workbook, or with the extra ``cyclers`` a binary file of Neware (.nda, .ndax) or BioLogic
-    (.mpr). Columns go by the names that testers give them; their units are told from the names.
+    (.mpr). The names of testers identify columns and their units.
 
-    It may hold charges and rests of the cell as well, and many cycles. A discharge is what lies between two charges, with the
-    rest before the load; it is numbered by the cycle that is given, or else counted. If there are several, each has its own
-    clock, which starts at its first sample. Discharges whose charges are not logged are told apart by the column of the cycle
-    alone. What is mended is said in a warning. A temperature that is missing in some rows is interpolated.
+    The file may also hold charges and rests of the cell, and many cycles. A discharge is the part between two charges, with
+    the rest before the load. Its number is the cycle in the file, or a count. Each of several discharges has a clock that
+    starts at its first sample. If the charges are not logged, only a column of the cycle separates discharges. A warning names
+    all corrections. A temperature that is missing in some rows is interpolated.
 
     .. code-block:: python
 
@@ -74,17 +74,17 @@ def read_discharges(
       discharges = read_discharges(frame)
 
     :param source: the file, or the table
-    :param columns: by quantity (``time``, ``voltage``, ``current``, ``temperature``, ``ambient``, ``cycle``, ``step``,
-        ``state``, ``cell``), the name of its column, where the names do not tell
-    :param units: by quantity, its unit, where the name does not tell: ``s``, ``ms``, ``min``, ``h``; ``V``, ``mV``; ``A``,
+    :param columns: the column of each quantity (``time``, ``voltage``, ``current``, ``temperature``, ``ambient``, ``cycle``,
+        ``step``, ``state``, ``cell``), if the names are unknown
+    :param units: the unit of each quantity, if the name has none: ``s``, ``ms``, ``min``, ``h``; ``V``, ``mV``; ``A``,
         ``mA``; ``degC``, ``K``
-    :param discharge_is_negative: how the current of a discharge is counted; ``None``: told from the voltage, which jumps
-        against a load where that is switched, or from words for charge and discharge
-    :param ignore: names of columns that are not looked at
-    :param tester: whose table it is: a name of the testers' table, or a file in TOML that adds one; ``None``: told from it
-    :return: the discharges; their ``meta`` holds ``source`` and, if there are several or they are numbered, ``cycle``. One
-        that fails the checks of :class:`~battery_env.Discharge` is left out with a warning
-    :raises ValueError: if there is none, the file is damaged, or it does not tell what is asked for
+    :param discharge_is_negative: whether the current of a discharge is negative; ``None``: recognised from jumps of the
+        voltage at switches of the load, or from words for charge and discharge
+    :param ignore: names of columns to leave out
+    :param tester: the tester of the table: a name in the testers' table, or a TOML file; ``None``: recognised from the table
+    :return: the discharges; their ``meta`` holds ``source`` and, if there are several or they are numbered, ``cycle``. A
+        discharge that fails the checks of :class:`~battery_env.Discharge` is left out with a warning
+    :raises ValueError: if there is no discharge, the file is damaged, or a column or unit is unknown
     :raises ImportError: if the file needs an extra that is not installed
     """
     file_format = FileFormat(columns, units, discharge_is_negative, ignore, find_tester(tester))
@@ -118,12 +118,12 @@ def each_usable(use: Callable[[Discharge], Made], readers: Mapping[str, Callable
 
 def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) -> Discharge:
     """
-    Read one discharge from a text file, with the sign of its current as stated and not told.
+    Read one discharge from a text file, with a stated sign of the current.
 
-    :param path: the file, as :func:`read_discharges` takes it
-    :param discharge_is_negative: whether the file counts the current of a discharge as negative; it is flipped then
+    :param path: the file, as in :func:`read_discharges`
+    :param discharge_is_negative: whether the current of a discharge is negative in the file
     :return: the discharge; its ``meta`` holds ``source``
-    :raises ValueError: if the file holds none, or several, or if its values are invalid
+    :raises ValueError: if the file holds no discharge or several, or if its values are invalid
     """
     discharges = read_discharges(path, discharge_is_negative=discharge_is_negative)
     if len(discharges) > 1:
