@@ -209,8 +209,8 @@ def certify(
             raise ValueError(f"starts of shape {starts.shape} must be finite numbers of shape (n_starts, n_states).")
         if n_episodes_per_start < _LEAST_PER_START:
             raise ValueError(
-                f"n_episodes_per_start={n_episodes_per_start} must be at least {_LEAST_PER_START}: with fewer episodes no start "
-                f"state is known to be attracted with a probability of one half, even if all its episodes are."
+                f"n_episodes_per_start={n_episodes_per_start} must be at least {_LEAST_PER_START}: fewer episodes show no "
+                "start state to be attracted with a probability of one half, even if all of them are."
             )
     with closed_loop(policy, env, lyapunov, n_episodes, deterministic, seed) as loop:
         own_bound = ultimate_bound is None and lyapunov is not None and lyapunov.ultimate_bound is not None
