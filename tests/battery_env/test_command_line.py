@@ -288,7 +288,7 @@ def test_a_folder_ends_with_how_its_cell_changed_and_names_what_is_written(tmp_p
 
 
 def test_an_option_of_settings_that_there_is_not_names_the_one_that_is_meant():
-    with pytest.raises(TypeError, match="Settings takes no 'nominal': did you mean nominal_Ah?"):
+    with pytest.raises(TypeError, match="Settings takes no 'nominal': did you mean nominal_Ah"):
         battery_env.Settings(nominal=2.0)
 
 
