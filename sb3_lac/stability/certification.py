@@ -31,9 +31,8 @@ NEEDS = {
     "that starts above that level and is longer than that",
 }
 
-# A start state is attracted if the interval of its probability lies above this, which takes so many episodes that all are
-_ATTRACTED = 0.5
-_LEAST_PER_START = math.ceil(math.log((1 - CONFIDENCE) / 2, _ATTRACTED))
+# The interval of a start state lies above one half if all of so many episodes are attracted
+_LEAST_PER_START = math.ceil(math.log((1 - CONFIDENCE) / 2, 0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +99,7 @@ class CertificationReport:
             f"{100 * self.confidence_of_each:.4g} % (Bonferroni)."
         )
         if self.starts is not None:
-            attracted = (self.starts["low"] >= _ATTRACTED).sum()
+            attracted = (self.starts["low"] >= 0.5).sum()
             lines.append(
                 f"Region of attraction: {attracted} of {len(self.starts)} start states are attracted with a probability of at "
                 f"least one half, each by its own {100 * CONFIDENCE:g} % interval of "
