@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable
 from difflib import get_close_matches
 from functools import wraps
 from numbers import Real
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,9 +23,6 @@ LOAD_UNIT_SYMBOLS: dict[str, str] = {"power": "W", "current": "A"}
 ZERO_CELSIUS_K = 273.15
 
 
-_Class = TypeVar("_Class", bound=type)
-
-
 def check_options(caller: str, given: Iterable[str], known: Collection[str]) -> None:
     """Refuse an option that there is not, with the one that may be meant."""
     for name in given:
@@ -34,7 +31,7 @@ def check_options(caller: str, given: Iterable[str], known: Collection[str]) -> 
             raise TypeError(f"{caller} takes no {name!r}: " + (f"did you mean {meant[0]}?" if meant else f"give {[*known]}"))
 
 
-def hinting(made: _Class) -> _Class:
+def hinting(made: Any) -> Any:
     """A dataclass that names the option that may be meant, where it is given one that it does not have."""
     init: Callable[..., None] = made.__init__
 
