@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable, Collection, Iterable
+from difflib import get_close_matches
+from functools import wraps
 from numbers import Real
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +21,27 @@ LOAD_LIMITS: dict[str, float] = {"power": 5000.0, "current": 1000.0}
 LOAD_UNIT_SYMBOLS: dict[str, str] = {"power": "W", "current": "A"}
 #: 0 degC in K.
 ZERO_CELSIUS_K = 273.15
+
+
+def check_options(caller: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Refuse an option that there is not, with the one that may be meant."""
+    for name in given:
+        if name not in known:
+            meant = get_close_matches(name, known, 1)
+            raise TypeError(f"{caller} takes no {name!r}: " + (f"did you mean {meant[0]}?" if meant else f"give {[*known]}"))
+
+
+def hinting(made: Any) -> Any:
+    """A dataclass that names the option that may be meant, where it is given one that it does not have."""
+    init: Callable[..., None] = made.__init__
+
+    @wraps(init)
+    def checked(self: Any, *arguments: Any, **options: Any) -> None:
+        check_options(made.__name__, options, made.__dataclass_fields__)
+        init(self, *arguments, **options)
+
+    made.__init__ = checked
+    return made
 
 
 def check_real(name: str, values: object) -> None:

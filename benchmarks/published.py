@@ -1,6 +1,6 @@
 """
 The experiments of Han et al. (2020) that can be made here: LAC as published and SAC on the cart and pole and on the synthetic
-gene network, and what impulses, other parameters, noise and other references do to their policies.
+oscillator, and what impulses, other parameters, noise and other references do to their policies.
 
 .. code-block:: bash
 
@@ -104,7 +104,7 @@ DISTURBANCES: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
 
 
 class EndFarAway(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
-    """Ends an episode with a step that costs more than 100, as the authors' gene network does in training."""
+    """Ends an episode with a step that costs more than 100, as the authors' oscillator does in training."""
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -113,7 +113,7 @@ class EndFarAway(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
 
 class OtherReferenceEnv(OscillatorEnv):
     """
-    The gene network with a reference that nobody was trained with.
+    The oscillator with a reference that nobody was trained with.
 
     :param mean: of the reference
     :param amplitude: of its sine
@@ -129,7 +129,7 @@ class OtherReferenceEnv(OscillatorEnv):
 
 
 def make_env(env_id: str, reference: tuple[float, float, int] | None = None, **arguments: Any) -> gym.Env[Any, Any]:
-    """An environment with a disturbance, or the gene network with another reference."""
+    """An environment with a disturbance, or the oscillator with another reference."""
     if reference is None:
         return gym.make(env_id, **arguments)
     max_episode_steps = gym.spec(env_id).max_episode_steps

@@ -5,6 +5,7 @@ import re
 import shlex
 
 from checks.pages import DOCS, GUIDE, PAGES, REPORTS, ROOT, blocks, prose, published
+from docs.conf import TUTORIALS, notebook_of
 
 #: What the changelog tells, and nothing else: a page says what is.
 HISTORY = r"\b(before that version|earlier version|earlier update|once had|at first|used to be|no longer|by hand before)\b"
@@ -25,6 +26,16 @@ def test_commands_in_pages_exist():
                 assert importlib.util.find_spec(words[2]) is not None, f"{page.name}: {line}"
             elif words[:1] == ["make"]:
                 assert re.search(rf"^{words[1]}:", makefile, flags=re.MULTILINE), f"{page.name}: {line}"
+
+
+def test_the_notebook_of_a_tutorial_has_its_python_as_cells_and_its_commands_for_a_shell():
+    for name in TUTORIALS:
+        page = DOCS / f"{name}.md"
+        notebook = notebook_of(text_of(page))
+        cells = [cell.source.strip() for cell in notebook.cells if cell.cell_type == "code"]
+        commands = [cell for cell in cells if cell.startswith("%%bash")]
+        assert [each for each in cells if each not in commands] == [block.strip() for block in blocks(page, "python")]
+        assert [each.partition("\n")[2] for each in commands] == [block.strip() for block in blocks(page, "bash")]
 
 
 def test_pages_agree_on_how_long_the_demo_takes():

@@ -116,13 +116,32 @@ def draw_formula(translator: Any, node: nodes.math | nodes.math_block) -> None:
 TUTORIALS = ("first_controller", "first_discharge", "own_problem", "cell_life")
 
 
+# without it a page that begins with a command becomes a notebook of commands
+OF_PYTHON = """---
+jupyter:
+  kernelspec: {display_name: Python 3, language: python, name: python3}
+---
+"""
+
+
+def notebook_of(page: str) -> Any:
+    """
+    The notebook of a page: Python as cells, commands as cells whose exit status stops nothing; of links and pictures, which
+    lead to files of the site, the text.
+    """
+    text = re.sub(r"!?\[([^\]]*)\]\((?!http)[^)]*\)|<!--.*?-->", r"\1", page)
+    notebook = jupytext.reads(OF_PYTHON + text, fmt="md")
+    for cell in notebook.cells:
+        cell.source = re.sub(r"\A%%bash$", "%%bash --no-raise-error", cell.source, flags=re.MULTILINE)
+    return notebook
+
+
 def offer_notebook(app: Sphinx, docname: str, source: list[str]) -> None:
-    """A tutorial as a notebook: Python as cells; of links and pictures, which lead to files of the site, the text."""
+    """Write a tutorial as a notebook, too, which its page leads to."""
     if docname in TUTORIALS:
         file = ROOT / "docs" / "_notebooks" / f"{docname}.ipynb"
         file.parent.mkdir(exist_ok=True)
-        text = re.sub(r"!?\[([^\]]*)\]\((?!http)[^)]*\)|<!--.*?-->", r"\1", source[0])
-        jupytext.write(jupytext.reads(text, fmt="md"), file)
+        jupytext.write(notebook_of(source[0]), file)
         source[0] += f"\n[This page as a Jupyter notebook](_notebooks/{file.name})\n"
 
 

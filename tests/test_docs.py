@@ -49,7 +49,7 @@ def run_briefly(source, name, folder, monkeypatch):
     source = re.sub(r"\bfor seed in range\(\d+\)", "for seed in range(1)", source)
     source = re.sub(r"\bn_steps: int = [\d_]+", "n_steps: int = 520", source)
     source = re.sub(r"\b(n_envs|n_episodes)=\d+", r"\1=10", source)
-    source = re.sub(r"\bn_episodes_per_start=\d+", "n_episodes_per_start=2", source)
+    source = re.sub(r"\bn_episodes_per_start=\d+", "n_episodes_per_start=6", source)
     exec(compile(source, name, "exec"), {"__name__": "__main__"})
 
 

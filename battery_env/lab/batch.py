@@ -49,6 +49,7 @@ from battery_env.lab.sources import (
     read_source,
     record_name,
 )
+from battery_env.records.discharge import Discharge
 from battery_env.records.recording import Recording
 from battery_env.records.refusals import RecordError
 
@@ -279,6 +280,8 @@ class Results:
         self._header: dict[str, Any] = json.loads(_json({"format": _FORMAT, "battery_env": VERSION, **made_with}))
         self._rows: dict[tuple[str, int], dict[str, Any]] = {}
         self._counts: dict[str, int] = {}
+        #: The files that are written, by name.
+        self.written: list[str] = []
         #: How many lines are not as they were written.
         self.spoiled = 0
         check_folder(folder)
@@ -385,6 +388,7 @@ class Results:
         """Write a file of this run."""
         with replacing(self.folder / name) as part:
             make(part)
+        self.written.append(name)
 
     def write_tables(self) -> None:
         """Write the table of all rows, if any discharge could be used, and if several are whole a figure of them."""
@@ -557,12 +561,17 @@ def _unused(name: str, used: set[str]) -> str:
     return unused
 
 
-def _calibrate(name: str, recording: Recording, settings: Settings, with_voltages: bool) -> tuple[Calibration, Attempt]:
-    """What the discharge says, and its voltages as files by their suffixes."""
+def calibrate_recording(discharge: Discharge, recording: Recording, settings: Settings) -> Calibration:
+    """What a discharge of a file says; an error shows the commands that may mend the file."""
     try:
-        found = calibrate(recording.discharge(), settings)
+        return calibrate(discharge, settings)
     except RecordError as error:
         raise error.of(recording.origin) from error
+
+
+def _calibrate(name: str, recording: Recording, settings: Settings, with_voltages: bool) -> tuple[Calibration, Attempt]:
+    """What the discharge says, and its voltages as files by their suffixes."""
+    found = calibrate_recording(recording.discharge(), recording, settings)
     files = attempt(_voltages_of, name, found) if with_voltages else Attempt({}, [], "")
     return replace(found, record=None, forecast=None, end=None), files
 

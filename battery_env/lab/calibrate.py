@@ -6,7 +6,6 @@ import os
 import warnings
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
-from difflib import get_close_matches
 from functools import partial
 from math import hypot
 from numbers import Real
@@ -18,7 +17,7 @@ import pandas as pd
 from typing_extensions import Unpack
 
 from battery_env.arrays import FloatArray
-from battery_env.checks import ZERO_CELSIUS_K
+from battery_env.checks import ZERO_CELSIUS_K, check_options
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.ends import quantile
 from battery_env.estimates import Estimate, Finding
@@ -100,9 +99,7 @@ def calibrate(
     :raises TypeError: for an unknown option
     """
     known = (SettingsOptions if isinstance(source, Discharge) else Options).__annotations__
-    for name in options.keys() - known.keys():
-        meant = get_close_matches(name, known, 1)
-        raise TypeError(f"calibrate takes no {name!r}: " + (f"did you mean {meant[0]}?" if meant else f"give {[*known]}"))
+    check_options("calibrate", options, known)
     of_file = {name: options.pop(name) for name in options.keys() - SettingsOptions.__annotations__.keys()}
     settings = (Settings() if settings is None else settings).but(**options)
     if isinstance(source, Discharge):

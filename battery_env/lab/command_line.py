@@ -31,9 +31,9 @@ from battery_env.lab.page_server import serve
 from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.readers.testers import find_tester, tester_file
-from battery_env.lab.report import line_of, text_of
+from battery_env.lab.report import Calibration, change_of, line_of, text_of
 from battery_env.lab.settings import METHODS, Settings
-from battery_env.lab.sources import Source, find_sources, read_source
+from battery_env.lab.sources import VOLTAGE, Source, few_of, find_sources, read_source
 from battery_env.loads import constant
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
@@ -347,6 +347,8 @@ def _calibrate_all(
     results: Results | None,
 ) -> int:
     states: Counter[str] = Counter()
+    cells: Counter[str] = Counter()
+    ends: list[Calibration] = []  # the first and the last that are settled
     first: Outcome | None = None
     is_interrupted = False
     if results and results.spoiled:
@@ -365,6 +367,9 @@ def _calibrate_all(
                         _print_line(each)
                 first = first or outcome
                 states[outcome.state] += 1
+                cells[outcome.cell] += 1
+                if outcome.found and outcome.found.settled:
+                    ends = [*ends[:1], outcome.found]
     except KeyboardInterrupt:
         print("interrupted: what is done is kept" + (", and the same command goes on" if results else ""), file=sys.stderr)
         is_interrupted = True
@@ -376,10 +381,12 @@ def _calibrate_all(
         if states.total() > 1:
             counts = ", ".join(f"{states[state]} {state}" for state in ("settled", "not settled", "refused"))
             print(f"\n{states.total()} discharges: {counts}")
+            if len(ends) > 1 and len(cells) in (1, states.total()):  # a file each is one cell's, as in life.png
+                print(f"{change_of(*ends)}, {states['settled']} of {states.total()} settled")
         elif first and first.found:
             print(text_of(first.record, first.found))
         if results and results.has_numbers:
-            print(f"\nwritten to {results.folder}")
+            print(f"\nwritten to {results.folder}: {few_of(sorted(results.written, key=lambda name: VOLTAGE in name))}")
     if is_interrupted:
         return INTERRUPTED
     return REFUSED if states["refused"] else NOT_SETTLED if states["not settled"] else SETTLED

@@ -281,7 +281,7 @@ def _notes(estimate: Estimate, record: Samples, goes_on_varied: bool) -> list[st
         )
     if not estimate.settled and is_only_imprecise(estimate.findings):
         notes.append(
-            "The record alone does not tell both numbers yet, as before a knee: the interval counts that. `reason` says more."
+            f"The record alone does not tell both numbers yet, as before a knee: the interval counts that. {estimate.reason}"
         )
     elif not estimate.settled:
         notes.append(f"The estimate is not settled. {estimate.reason}".strip())

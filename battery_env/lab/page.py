@@ -12,13 +12,12 @@ import plotly.graph_objects as go
 import streamlit as st
 from plotly.colors import qualitative
 
-from battery_env.lab.batch import attempt, with_codes
-from battery_env.lab.calibrate import calibrate
+from battery_env.lab.batch import attempt, calibrate_recording, with_codes
 from battery_env.lab.life import Life, life_before
 from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.report import Calibration
-from battery_env.lab.running import forecast_end
+from battery_env.lab.running import calibrate_running, forecast_end
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import Source, find_sources, no_formula, read_source, record_name
 from battery_env.loads import constant
@@ -35,10 +34,13 @@ SHORT = {
     "measured (mohm)": "measured_resistance_10s_ohm",
     "state of health": "state_of_health",
 }
+ALONE = {"q_max": "q_mobile_C", "state of health": "state_of_health"}
 # What can be stated of files: where a quantity stands and in which unit, the sign of a discharge, the charge at its start.
 UNITS = {"time": ("s", "ms", "min", "h"), "voltage": ("V", "mV"), "current": ("A", "mA"), "temperature": ("degC", "K")}
 TOLD = "told from the voltage"
 SIGNS = {TOLD: None, "negative": True, "positive": False}
+# A cell to begin with.
+EXAMPLE = "B0005"
 FULL, RESTED, KNOWN = "with a full cell", "at rest: the voltage tells the charge", "with a known charge"
 
 
@@ -59,7 +61,9 @@ def ask() -> tuple[list[Any], str, bool, FileFormat, dict[str, Any]]:
     )
     # what its owner may read is only for whoever knows the address of the page, which has a secret
     place = "or name a folder of this machine, or a bundled cell: B0005"
-    folder = side.text_input(place) if st.get_option("server.baseUrlPath") else ""
+    if st.get_option("server.baseUrlPath"):
+        side.text_input(place, key="folder")
+    folder = state.get("folder", "")
     is_one_cell = side.checkbox("all files are of one cell, the oldest first")
     cut_off_V = side.number_input("cut-off (V)", 0.5, value=None, placeholder="2.7, or that of my_cell.json", step=0.1)
     nominal_Ah = side.number_input("nominal capacity (Ah)", 0.001, value=None, placeholder="not known", step=0.1)
@@ -105,13 +109,21 @@ def read(paths: list[str], file_format: FileFormat, troubles: list[str]) -> list
     for source in sources or ():
         found, notes, error = attempt(read_source, source, file_format)
         name = Path(source.path).name
-        troubles += [f"**{name}**: {each}".replace(f"{source.path}: ", "") for each in (*notes, error) if each]
+        troubles += [in_markdown(name, each.replace(f"{source.path}: ", "")) for each in (*notes, error) if each]
         recordings += [(source, each) for each in found or ()]
         unread += [source] if error else []
-    for source in (*unread, *(sources or ()))[:1]:
+    for source in (*unread, *(sources or ())):
         table, *_ = attempt(recognised_of, Path(source.path), file_format)
-        st.session_state.table = (*table, bool(unread)) if table else None
+        if table:  # of a picture nothing is
+            st.session_state.table = (*table, bool(unread))
+            break
     return recordings
+
+
+def in_markdown(name: str, text: str) -> str:
+    """What is said of a file: a sentence, and below it lines and commands as they are."""
+    sentence, _, lines = text.partition("\n")
+    return f"**{name}**: {sentence}" + (f"\n\n```text\n{lines}\n```" if lines else "")
 
 
 def answer(files: list[Any], folder: str, is_one_cell: bool, file_format: FileFormat, stated: dict[str, Any]) -> None:
@@ -134,7 +146,7 @@ def answer(files: list[Any], folder: str, is_one_cell: bool, file_format: FileFo
         bar.progress(number / len(recordings), f"{name}, {number + 1} of {len(recordings)}; the very first one takes longer")
         cell = no_formula(str(recording.meta.get("cell", "cell" if is_one_cell else source.cell)))
         seen, notes, error = attempt(looked_at, name, cell, recording, state.settings)
-        troubles += [f"**{name}**: {each}" for each in (*notes, error) if each]
+        troubles += [in_markdown(name, each) for each in (*notes, error) if each]
         state.found += [seen] if seen else []
     if all(each.discharge.meta.get("start_time") for each in state.found):
         state.found.sort(key=lambda each: each.discharge.meta["start_time"])
@@ -151,7 +163,8 @@ def settings_of(cells: list[Path], stated: dict[str, Any]) -> Settings:
 
 def looked_at(name: str, cell: str, recording: Recording, settings: Settings) -> Found:
     """What a discharge says."""
-    return Found(name, cell, discharge := recording.discharge(), calibrate(discharge, settings))
+    discharge = recording.discharge()
+    return Found(name, cell, discharge, calibrate_recording(discharge, recording, settings))
 
 
 def show_numbers(says: Calibration) -> None:
@@ -162,7 +175,8 @@ def show_numbers(says: Calibration) -> None:
     for place, (label, name) in zip(places, columns.items(), strict=True):
         sd = "" if np.isnan(getattr(says, name)) else f"sd {says.sd_of(name) or 'not stated'}"
         place.metric(label, says.shown(name), sd, "off", delta_arrow="off")
-    settled.metric("settled", "yes" if says.settled else f"only {says.settled_alone}" if says.settled_alone else "no")
+    in_part = f"only {says.settled_alone}" if says.settled_alone else ""
+    settled.metric("settled", "yes" if says.settled else "no", in_part, "off", delta_arrow="off")
     if says.findings:
         st.error(f"Not settled: {says.reason}")
 
@@ -177,6 +191,11 @@ def over_the_life(table: pd.DataFrame, column: str, label: str, scale: float) ->
         style = {"name": cell, "line_color": colour, "mode": "lines+markers", "error_y_thickness": 0.4, "error_y_width": 0}
         figure.add_scatter(x=number, y=scale * rows[column], error_y_array=scale * sd, marker_symbol=symbol, **style)
     return figure
+
+
+def show_example() -> None:
+    """Take the cell that comes with the package."""
+    st.session_state.folder = EXAMPLE
 
 
 def show_end(chosen: Found, life: Life | None, settings: Settings) -> None:
@@ -213,7 +232,7 @@ def show_end(chosen: Found, life: Life | None, settings: Settings) -> None:
 def main() -> None:
     """The page, from top to bottom."""
     st.set_page_config("battery-calibrate", layout="wide")
-    st.title("How worn is the cell, and when is it empty?")
+    st.title("How healthy is the cell, and when will it be empty?")
     asked, state = ask(), st.session_state
     if state.get("asked") != asked:
         answer(*asked)
@@ -224,7 +243,12 @@ def main() -> None:
         ask_how_to_read(*state.table)
     found: list[Found] = state.found
     if not found:
-        st.info("Give discharges at the left. The last one of a cell may be in progress.")
+        st.info("Give discharges at the left (on a narrow screen behind »). The last one of a cell may be in progress.")
+        st.button(f"Or show me a cell: the life of {EXAMPLE}, from NASA", on_click=show_example, type="primary")
+        st.caption(
+            "168 discharges in a minute or two: q_max and the resistance of each with a standard deviation, how both "
+            "change over the life, and the forecast of an end."
+        )
         return
     chosen = found[st.selectbox("discharge", range(len(found)), len(found) - 1, format_func=lambda n: found[n].name) or 0]
     of_cell = [each for each in found if each.cell == chosen.cell]
@@ -232,17 +256,21 @@ def main() -> None:
         state.lives[chosen.cell] = attempt(life_before, [each.discharge for each in of_cell], state.settings).result
     life, earlier = state.lives.get(chosen.cell), [each.name for each in of_cell].index(chosen.name)
     before = attempt(life.after, earlier).result if life and earlier else None
+    with_life = None
+    if chosen.says.in_progress and before:
+        with_life = attempt(partial(calibrate_running, life=before), chosen.discharge, state.settings).result
     table = pd.DataFrame({"record": each.name, "cell": each.cell} | each.says.row() for each in found)
     lives = table[table.groupby("cell")["cell"].transform("size") > 1]
-    if lives.empty:
+    show_numbers(with_life or chosen.says)
+    if with_life:
+        alone = [f"{label} {chosen.says.shown(name)}" for label, name in ALONE.items()]
+        st.caption(f"With the life of the cell before. This record alone: {', '.join(alone)}, {chosen.says.state}.")
+    if chosen.says.in_progress or st.toggle("Forecast its end from a part of it"):
         show_end(chosen, before, state.settings)
-        show_numbers(chosen.says)
-    else:
-        show_numbers(chosen.says)
+    if not lives.empty:
         left, right = st.columns(2)
         left.plotly_chart(over_the_life(lives, "q_mobile_C", "q_max (Ah)", 1.0 / 3600.0))
         right.plotly_chart(over_the_life(lives, "resistance_10s_ohm", "10 s resistance (mohm)", 1e3))
-        show_end(chosen, before, state.settings)
     short = [{label: each.says.shown(name, with_unit=False) for label, name in SHORT.items()} for each in found]
     settled = [each.says.state for each in found]
     st.dataframe(table[["record", "cell"]].join(pd.DataFrame(short)).assign(settled=settled), hide_index=True)

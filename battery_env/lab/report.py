@@ -234,6 +234,12 @@ def line_of(name: str, found: Calibration) -> str:
     return f"{name:<18} " + "  ".join([*_numbers(found), f"{found.state}: {found.reason}" if found.findings else found.state])
 
 
+def change_of(first: Calibration, last: Calibration) -> str:
+    """How the numbers of a cell went from one discharge to another."""
+    columns = ("q_mobile_C", f"{last.resistance}_ohm")
+    return ", ".join(f"{_HOW[each]['text']} {first.shown(each, with_unit=False)} -> {last.shown(each)}" for each in columns)
+
+
 def title_of(name: str, found: Calibration) -> str:
     """The same above a figure."""
     numbers = ", ".join(" ".join(each.split()) for each in _numbers(found))

@@ -139,10 +139,16 @@ def forecast_end(
         Constants are held along with a life, or with a prior and a load: they and ``r_o`` carry over together
     :raises ValueError: if the discharge cannot be used, or a load cannot be meant
     """
-    settings = Settings() if settings is None else settings
-    end = calibrated(discharge, _known_before(discharge, settings, load, life), load, samples, end_is_asked=True).end
+    end = calibrate_running(discharge, Settings() if settings is None else settings, load, samples, life).end
     assert end is not None
     return end
+
+
+def calibrate_running(
+    discharge: Discharge, settings: Settings, load: LoadToCome | None = None, samples: int = 1000, life: Life | None = None
+) -> Calibration:
+    """What a discharge in progress says, with the life of its cell before, and the end that :func:`forecast_end` tells."""
+    return calibrated(discharge, _known_before(discharge, settings, load, life), load, samples, end_is_asked=True)
 
 
 def read_load(path: str | Path) -> Load:
@@ -251,7 +257,7 @@ def end_of_record(
         if len(named) > 1:
             raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")
         past = life_before(before, settings)
-    found = calibrated(running, _known_before(running, settings, to_come, past), to_come, end_is_asked=True)
+    found = calibrate_running(running, settings, to_come, life=past)
     if not found.in_progress:
         raise ValueError(
             f"{argument} reaches {settings.resolved.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is "

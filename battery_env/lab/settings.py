@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
 
-from battery_env.checks import check_positive
+from battery_env.checks import check_positive, hinting
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
@@ -59,6 +59,7 @@ class ResolvedSettings(NamedTuple):
     usual_start: DischargeStart | None
 
 
+@hinting
 @dataclass(frozen=True)
 class Settings:
     """

@@ -11,7 +11,7 @@ from typing import Any
 #: What a table in Python is called, as it has no path.
 TABLE = "DataFrame"
 # Options of a file that are repeated in a command.
-_STATED = ("columns", "units", "ignore", "discharge_is_negative")
+_STATED = ("columns", "units", "ignore", "tester", "discharge_is_negative")
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Origin:
 
     def command(self, advice: Advice) -> str:
         """What can be pasted: of a file a command, of a table a call in Python."""
-        options = {name: self.stated[name] for name in _STATED if self.stated.get(name) not in (None, (), [])}
+        options = {name: self.stated[name] for name in _STATED if self.stated.get(name) not in (None, (), [], {})}
         value, before = advice.value, options.get(advice.option)
         if isinstance(value, Mapping):
             value = {**(before or {}), **value}
@@ -61,6 +61,8 @@ class Origin:
             value = [*(before or []), *value]
         options[advice.option] = value
         if self.source == TABLE:
+            if tester := options.get("tester"):
+                options["tester"] = str(tester)
             return f"read_discharges(table, {', '.join(f'{name}={each!r}' for name, each in options.items())})"
         words = [word for name, each in options.items() for word in _words(name, each)]
         return shlex.join(["battery-calibrate", self.source, *words])

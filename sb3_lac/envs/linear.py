@@ -22,7 +22,7 @@ class LinearCostEnv(CostEnv):
     """
     ## Description
 
-    A force has to bring a lightly damped oscillator with a little noise to rest: the linear-quadratic regulator problem.
+    A force has to bring a lightly damped mass on a spring to rest, with little noise: the linear-quadratic regulator problem.
     LAC can be compared with exact solutions here: the best policy (`optimal_gain`), the value L of a linear policy
     (`cost_to_go`), and the largest feasible alpha3 of the decrease condition (`largest_feasible_alpha3`).
 

@@ -13,9 +13,9 @@ class OscillatorEnv(CostEnv):
     """
     ## Description
 
-    A synthetic gene network, the repressilator: three messengers m and their proteins p, each of which represses the next
-    messenger. The first protein has to follow a sine by light that drives the messengers: the tracking task of Han et al.
-    (2020), after Elowitz and Leibler (2000).
+    The oscillator is a gene network, the repressilator: three messengers m and their proteins p, each of which represses the
+    next messenger. The first protein has to follow a sine by light that drives the messengers: the tracking task of Han et
+    al. (2020), after Elowitz and Leibler (2000).
 
     With j = 3, 1, 2 for i = 1, 2, 3 and steps of dt = 1:
 

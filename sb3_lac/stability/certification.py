@@ -31,6 +31,9 @@ NEEDS = {
     "that starts above that level and is longer than that",
 }
 
+# The interval of a start state lies above one half if all of so many episodes are attracted
+_LEAST_PER_START = math.ceil(math.log((1 - CONFIDENCE) / 2, 0.5))
+
 
 @dataclass(frozen=True, eq=False)
 class CertificationReport:
@@ -191,7 +194,7 @@ def certify(
     :param ultimate_bound: The cost to stay within, by default that of ``lyapunov``. Each fit has another bound: to compare
         loops, state one bound for all.
     :param starts: Initial states on a grid, shape (n, n_states), each passed to ``env.reset(options={"state": ...})``
-    :param n_episodes_per_start: Number of episodes from each initial state
+    :param n_episodes_per_start: Number of episodes from each initial state, at least 6
     :param deterministic: Whether to certify the mean action or sampled actions
     :param seed: Seed of the episodes, not a seed of the fit (refused) or of the training; drawn if None, and named in the
         report's description
@@ -201,10 +204,12 @@ def certify(
     check_bound(ultimate_bound)
     if starts is not None:
         starts = np.asarray(starts, dtype=np.float64)
-        if starts.ndim != 2 or len(starts) == 0 or not np.isfinite(starts).all() or n_episodes_per_start < 1:
+        if starts.ndim != 2 or len(starts) == 0 or not np.isfinite(starts).all():
+            raise ValueError(f"starts of shape {starts.shape} must be finite numbers of shape (n_starts, n_states).")
+        if n_episodes_per_start < _LEAST_PER_START:
             raise ValueError(
-                f"starts of shape {starts.shape} must be finite numbers of shape (n_starts, n_states), and "
-                f"n_episodes_per_start={n_episodes_per_start} at least 1."
+                f"n_episodes_per_start={n_episodes_per_start} must be at least {_LEAST_PER_START}: fewer episodes show no "
+                "start state to be attracted with a probability of one half, even if all of them are."
             )
     with closed_loop(policy, env, lyapunov, n_episodes, deterministic, seed) as loop:
         own_bound = ultimate_bound is None and lyapunov is not None and lyapunov.ultimate_bound is not None

@@ -267,6 +267,31 @@ def test_a_command_that_is_shown_keeps_what_was_stated_and_its_table_is_that_of_
     assert name == "battery-calibrate" and command(arguments) == 0
 
 
+def test_a_command_that_is_shown_keeps_the_tester_and_works(recorded, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    table = pd.DataFrame({"alpha": recorded.time_s, "beta": recorded.voltage_V, "gamma": 1e3 * recorded.current_A})
+    table.to_csv("a.csv", index=False)
+    Path("mine.toml").write_text('[columns]\ntime = "alpha"\nvoltage = "beta"\ncurrent = "gamma"\n', encoding="utf-8")
+    assert command(["a.csv", "--tester", "mine.toml"]) == 2
+    shown = capsys.readouterr().err.splitlines()[-1]
+    _, *arguments = shlex.split(shown)
+    assert "mine.toml" in arguments and command(arguments) == 0
+
+
+def test_a_folder_ends_with_how_its_cell_changed_and_names_what_is_written(tmp_path, terminal):
+    shown = terminal.shows("B0005:1", "B0005:100", "--out", tmp_path / "r")
+    first, last = battery_env.calibrate("B0005:1")[0], battery_env.calibrate("B0005:100")[0]
+    assert f"q_max {first.shown('q_mobile_C', with_unit=False)} -> {last.shown('q_mobile_C')}, 10 s resistance" in shown
+    assert "2 of 2 settled" in shown
+    named = shown.rpartition("written to ")[2].partition(": ")[2].strip().split(", ")
+    assert sorted(named) == sorted(each.name for each in (tmp_path / "r").iterdir() if each.suffix in (".csv", ".png"))
+
+
+def test_an_option_of_settings_that_there_is_not_names_the_one_that_is_meant():
+    with pytest.raises(TypeError, match="Settings takes no 'nominal': did you mean nominal_Ah"):
+        battery_env.Settings(nominal=2.0)
+
+
 def test_the_version_is_that_of_the_package(capsys):
     with pytest.raises(SystemExit, match="0"):
         command(["--version"])

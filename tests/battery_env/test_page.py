@@ -11,8 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import NEW_CELL, calibrate, load_nasa_discharges
+from battery_env import NEW_CELL, Settings, calibrate, load_nasa_discharges, read_discharges
 from battery_env import __file__ as package
+from battery_env.lab.life import life_before
+from battery_env.lab.running import forecast_end
 
 pytest.importorskip("streamlit")
 pytest.importorskip("plotly")
@@ -71,17 +73,60 @@ def test_a_folder_of_one_cell_shows_its_numbers_its_life_and_the_end_of_a_discha
         "settled": "yes",
     }
     assert [each.value.partition(":")[0] for each in page.warning] == ["**notes.csv**"] and not page.error
-    assert len(page.get("plotly_chart")) == 3
+    assert len(page.get("plotly_chart")) == 2
     assert page.dataframe[0].value["record"].tolist() == ["0", "1", "2", "3"]
     assert page.dataframe[0].value["cell"].nunique() == 1
 
     # at 60 % of the record the discharges before tell its end to a percent
+    page.toggle[0].set_value(True).run()
+    assert len(page.get("plotly_chart")) == 3
     true_min = LIFE[3].eod_time_s(2.7) / 60.0
     median, low, high = end_min(page)
     assert low < true_min < high and high - low < 0.03 * true_min and median == pytest.approx(true_min, rel=0.01)
     # a larger load is sooner over
     page.main.number_input[0].set_value(3.0).run()
     assert end_min(page)[0] < 0.95 * median
+
+
+def test_a_discharge_in_progress_has_the_one_health_of_its_life_and_its_own_in_small_print(folder, page):
+    (folder / "3.csv").write_text(csv(LIFE[3].until(LIFE[3].time_s[0] + 1500.0)), encoding="utf-8")
+    page.sidebar.checkbox[0].check()
+    page.sidebar.number_input[1].set_value(2.0)
+    page.sidebar.text_input[0].set_value(str(folder)).run()
+    settings = Settings(nominal_Ah=2.0)
+    running = read_discharges(folder / "3.csv")[0]
+    end = forecast_end(running, settings, life=life_before(LIFE[:3], settings))
+    health = float(numbers(page)["state of health"])
+    assert health == pytest.approx(np.median(end.state_of_health), abs=5e-3)
+    (small,) = (each.value for each in page.caption if "This record alone" in each.value)
+    assert f"state of health {calibrate(running, settings).shown('state_of_health')}" in small
+
+
+@pytest.mark.parametrize("name", ["picture", "charge", "milliamperes"])
+def test_a_file_is_answered_as_the_command_answers_it(name, page, terminal, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    time_s = np.arange(0.0, 5000.0, 10.0)
+    charge = pd.DataFrame({"time": time_s, "voltage": 3.2 + time_s / 5e3, "current": -1.5})
+    whole = pd.DataFrame({"time": LIFE[0].time_s, "voltage": LIFE[0].voltage_V, "current": 1e3 * LIFE[0].current_A})
+    content = {
+        "picture": b"\x89PNG\r\n\x1a\n" + bytes(100),
+        "charge": charge.to_csv(index=False).encode(),
+        "milliamperes": whole.to_csv(index=False).encode(),
+    }[name]
+    Path("a.csv").write_bytes(content)
+    said = terminal.refuses("a.csv").partition(": ")[2].partition(": ")[2]
+    page.sidebar.file_uploader[0].set_value([("a.csv", content, "text/csv")]).run()
+    assert not page.exception
+    shown = page.warning[0].value.replace("```text", "").replace("```", "")
+    assert " ".join(shown.split()) == f"**a.csv**: {said}" or " ".join(shown.split()) == f"**a**: {said}"
+
+
+def test_the_first_screen_has_a_cell_to_press_for(page, monkeypatch):
+    asked = []
+    monkeypatch.setattr("battery_env.lab.sources.load_nasa_discharges", lambda name: asked.append(name) or LIFE)
+    (button,) = page.main.button
+    button.click().run()
+    assert asked == ["B0005"] and len(page.dataframe[0].value) == len(LIFE) and page.sidebar.text_input[0].value == "B0005"
 
 
 def test_without_a_settled_number_the_page_says_why(folder, page):
@@ -119,10 +164,12 @@ def test_columns_units_sign_start_and_constants_are_stated_where_a_file_does_not
         page.selectbox(key=f"column of {quantity}").set_value(column)
         page.selectbox(key=f"unit of {quantity}").set_value(unit)
     page.selectbox(key="sign").set_value("negative")
-    page.button[0].click().run()
+    next(each for each in page.button if each.label == "Read again").click().run()
     said_Ah = float(numbers(page)["q_max"].split()[0])
     assert said_Ah == pytest.approx(calibrate(discharge).q_mobile_C / 3600.0, abs=2e-3) and not page.warning
-    # one discharge has no life, and its end stands first
+    # one discharge that is over has no life, and its end only on asking
+    assert not page.subheader and not page.get("plotly_chart")
+    page.toggle[0].set_value(True).run()
     assert [each.value for each in page.subheader] == ["When will it be empty?"] and len(page.get("plotly_chart")) == 1
 
     cell = replace(NEW_CELL, r_o=0.2).to_json(tmp_path / "my_cell.json").read_bytes()

@@ -70,12 +70,15 @@ def test_two_visitors_drop_files_state_how_they_are_read_and_leave_nothing(start
     assert not first.get_by_text("Deploy").count()
     picture(first, "1_empty")
 
-    # one whole discharge: the forecast above its numbers, and no life
+    # one whole discharge: its numbers, the forecast on asking, and no life
     drop(first, whole__csv=csv(WHOLE))
     first.get_by_text("the table with all columns").wait_for()
     picture(first, "2_one_discharge")
     says = calibrate(WHOLE)
     assert first.get_by_text(f"{says.q_mobile_C / 3600.0:.3f} Ah").count()
+    assert first.locator(".js-plotly-plot").count() == 0
+    first.get_by_text("Forecast its end").click()
+    first.get_by_text("Empty at").wait_for()
     assert first.locator(".js-plotly-plot").count() == 1
 
     # names that nobody knows, minutes and milliamperes, a charge that is known, and what is no record
@@ -93,11 +96,10 @@ def test_two_visitors_drop_files_state_how_they_are_read_and_leave_nothing(start
 
     # the other one sees none of it, and has a folder of this machine
     assert second.get_by_text("Give discharges at the left").count()
-    second.get_by_label("or name a folder").fill("B0005")
-    second.keyboard.press("Enter")
+    second.get_by_text("Or show me a cell").click()
     second.get_by_text("the table with all columns").wait_for()
     picture(second, "5_life")
-    assert second.locator(".js-plotly-plot").count() == 3 and not second.get_by_text("odd").count()
+    assert second.locator(".js-plotly-plot").count() == 2 and not second.get_by_text("odd").count()
     assert first.others == second.others == []
     page.ends_by(signal.SIGINT)
     assert page.left() == []

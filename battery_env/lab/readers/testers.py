@@ -46,6 +46,7 @@ class Tester:
     :param discharge_is_negative: how the current of a discharge is counted, where voltage and words do not tell
     :param encoding: of its text, where that is not UTF-8
     :param missing: what it writes for a value that was not measured, besides nothing and NaN
+    :param argument: the file that it is from
     """
 
     name: str
@@ -55,6 +56,10 @@ class Tester:
     discharge_is_negative: bool | None = None
     encoding: str = ""
     missing: Sequence[str] = ()
+    argument: str = ""
+
+    def __str__(self) -> str:
+        return self.argument or self.name
 
     @cached_property
     def ranks(self) -> dict[str, dict[str, int]]:
@@ -179,7 +184,8 @@ def find_tester(name: str | Path | Tester | None) -> Tester | None:
         if tester.name.lower() == str(name).strip().lower():
             return joined(tester, TESTERS[-1])
     try:
-        return _tester_of(Path(name).stem, tomllib.loads(Path(name).read_text(encoding="utf-8")))
+        tester = _tester_of(Path(name).stem, tomllib.loads(Path(name).read_text(encoding="utf-8")))
+        return replace(tester, argument=str(name))
     except FileNotFoundError as error:
         known = ", ".join(tester.name for tester in TESTERS)
         raise FileNotFoundError(f"no file {str(name)!r}, nor a tester of this name: known are {known}") from error
