@@ -1,7 +1,6 @@
 """
 Which numbers of an estimate are settled, and why not both: one function of an estimate, its standard deviations and the
-evidence of its record, for least squares, the filter, policies and the closed form; compiled (numba), as the filter asks after
-each sample.
+evidence of its record, for all calibrators.
 """
 
 from __future__ import annotations
@@ -63,7 +62,6 @@ class Assumptions(NamedTuple):
 
     gain_sd: float = 0.0  # of the current sensor, which scales both parameters
     sd_soc: float = 0.0  # of the charge at the start, as a share of it
-    cell_sd_r_o: float = 0.0  # what the constants of the cell leave open of ``r_o``, ohm
     knee_sd_C: float = 0.0  # of the charge beyond the knee of the model
     apart: tuple[float, float] = (0.0, 0.0)  # how far a policy is from the fit in its observation, C and ohm
     load_on_ohm: float = 0.0  # of the resistance after ten seconds, by the moment of load-on
@@ -114,8 +112,6 @@ def judge(judged: Row, evidence: Row, known: Assumptions) -> None:
         if not sd < most_sd:
             note(judged, Reason.MISSED, not is_r and evidence.missed_C > MOST_OF_SD * sd)
             if is_r:
-                _note_doubt(judged, k, Doubt.DROPPED, evidence.dropped_ohm)
-                _note_doubt(judged, k, Doubt.CONSTANTS, known.cell_sd_r_o)
                 _note_doubt(judged, k, Doubt.LOAD_ON, known.load_on_ohm if k > 1 else 0.0)
             else:
                 for number, size_C in enumerate(charges_in_doubt_C(evidence)):

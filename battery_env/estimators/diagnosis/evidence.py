@@ -91,8 +91,8 @@ _EXAMINED = table(
 )
 
 # The last switch of the load, 0 A once it was judged: the part of its size that the voltage has to follow, the voltage before
-# and the range since, the estimate before and the charge by it until now; and when one was taken back, 0 s if none was.
-_SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V before_ohm charge_C back_s")
+# and the range since, and the charge by it until now; and when one was taken back, 0 s if none was.
+_SWITCH = table("time_s size_A to_follow_A before_V lowest_V highest_V charge_C back_s")
 
 # Some samples of the last minute, and the last changes of the voltage from sample to sample, in rings.
 _RING = table(
@@ -135,7 +135,6 @@ EVIDENCE = table(
         ("left_C", "f8"),  # what a charge before had left to take
         ("missed_C", "f8"),  # charge that steps of the voltage show, and the current does not
         ("dropped_C", "f8"),  # charge of switches that were taken back, which it did not follow
-        ("dropped_ohm", "f8"),  # by how much they moved an estimate of r_o
         ("fault", _FAULT),
     ]
 )
@@ -293,7 +292,7 @@ def examine(evidence: Row, voltage: float, current: float, q_mobile: float, r_o:
         ring.n_changes += 1
         middle_V = middle(before.voltage_2_V, before.voltage_1_V, voltage)
         resistance_ohm = _least_resistance_ohm(evidence.start, q_mobile, r_o)
-        _examine_last(evidence, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile), r_o)
+        _examine_last(evidence, middle_V, resistance_ohm, max(q_mobile, cell_q_mobile))
         _look_for_missed(evidence, current)
         switch = evidence.switch
         lowest_V, highest_V = min(switch.lowest_V, voltage), max(switch.highest_V, voltage)
@@ -435,20 +434,19 @@ def _is_followed(evidence: Row, time_s: float, lowest_V: float, highest_V: float
 
 
 @compiled
-def _take_back(evidence: Row, current: float, r_o: float) -> bool:
+def _take_back(evidence: Row, current: float) -> bool:
     # A switch that the voltage did not follow, and that was taken back, was none: what it made of the charge is in doubt
     switch, last = evidence.switch, evidence.examined
     switched_A = current - last.current_A
     if (switch.size_A - switched_A) * switched_A >= 0.0:
         return False
     evidence.dropped_C += abs(switch.charge_C)
-    evidence.dropped_ohm += abs(r_o - switch.before_ohm)
     last.lagging_A, switch.size_A, switch.back_s = current, 0.0, evidence.time_s
     return True
 
 
 @compiled
-def _note_switch(evidence: Row, time_s: float, current: float, resistance_ohm: float, r_o: float) -> None:
+def _note_switch(evidence: Row, time_s: float, current: float, resistance_ohm: float) -> None:
     # whether the load jumped, or was switched, since the last sample that was examined
     switch, last = evidence.switch, evidence.examined
     last.largest_A = max(last.largest_A, abs(current))
@@ -463,14 +461,14 @@ def _note_switch(evidence: Row, time_s: float, current: float, resistance_ohm: f
         if _is_followed(evidence, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):  # or nothing was left to follow
             switch.size_A = 0.0
         if switch.size_A == 0.0:
-            switch.charge_C, switch.before_ohm = 0.0, r_o
+            switch.charge_C = 0.0
             # the last row before a switch may already have the voltage after it
             highest_V, lowest_V = max(last.earlier_V, last.voltage_V), min(last.earlier_V, last.voltage_V)
             switch.time_s, switch.before_V = time_s, highest_V if switched_A > 0.0 else lowest_V
             switch.lowest_V = switch.highest_V = evidence.before.voltage_1_V
         # steps the same way before it was judged are one switch: a mean over an interval shows a switch as two
         switch.size_A += switched_A
-        if _take_back(evidence, current, r_o):
+        if _take_back(evidence, current):
             return
         # the ohmic drop must follow little after a pulse too short for it to build up
         switch.to_follow_A = max(min(current - last.lagging_A, max(switch.size_A, 0.0)), min(switch.size_A, 0.0))
@@ -530,14 +528,14 @@ def _look_for_missed(evidence: Row, current: float) -> None:
 
 
 @compiled
-def _examine_last(evidence: Row, voltage: float, resistance_ohm: float, most_q: float, r_o: float) -> None:
+def _examine_last(evidence: Row, voltage: float, resistance_ohm: float, most_q: float) -> None:
     # The sample before the one at hand, with the middle voltage of three, which is no single wild one
     last, switch, before = evidence.examined, evidence.switch, evidence.before
     time_s, current = before.time_1_s, before.current_1_A
     if switch.size_A != 0.0:
         # some loggers write a voltage a sample later than its current: the first one after a switch may belong before it
         switch.lowest_V, switch.highest_V = min(switch.lowest_V, before.voltage_1_V), max(switch.highest_V, before.voltage_1_V)
-    _note_switch(evidence, time_s, current, resistance_ohm, r_o)
+    _note_switch(evidence, time_s, current, resistance_ohm)
     if switch.size_A != 0.0 and time_s - switch.time_s > _START_WINDOW_S:
         if not _is_followed(evidence, time_s, switch.lowest_V, switch.highest_V, resistance_ohm):
             find(evidence, Reason.NOT_FOLLOWED, switch.time_s, switch.size_A)
