@@ -87,7 +87,10 @@ class Doubt(_Row):
         "the tester counted another charge than current and time make. Check units and clock, and export the time since the "
         "start of the test."
     )
-    DROPPED = "the current changes for a moment, and the voltage does not follow. Check the current sensor and its logger."
+    DROPPED = (
+        "the current changes for a moment at {dropout_s:.0f} s, and the voltage does not follow. Check the current sensor and "
+        "its logger."
+    )
     SWITCHES = (
         "the load is switched between two samples, nobody knows when, {switches:.0f} times. Log a sample before and after "
         "each switch, a second apart, or the charge that the tester counts."
