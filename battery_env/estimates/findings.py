@@ -1,6 +1,6 @@
 """
-Findings: why an estimate is not settled, as data. One table has the reasons of least squares, the filter, policies and the
-closed form, in their order, another one what leaves a charge or a resistance in doubt. All texts are made here.
+Findings: why an estimate is not settled, as data. One table has the reasons of all calibrators in their order, another one
+what leaves a charge or a resistance in doubt. All texts are made here.
 :mod:`battery_env.estimators.verdict` goes by them.
 """
 
@@ -87,7 +87,10 @@ class Doubt(_Row):
         "the tester counted another charge than current and time make. Check units and clock, and export the time since the "
         "start of the test."
     )
-    DROPPED = "the current changes for a moment, and the voltage does not follow. Check the current sensor and its logger."
+    DROPPED = (
+        "the current changes for a moment at {dropout_s:.0f} s, and the voltage does not follow. Check the current sensor and "
+        "its logger."
+    )
     SWITCHES = (
         "the load is switched between two samples, nobody knows when, {switches:.0f} times. Log a sample before and after "
         "each switch, a second apart, or the charge that the tester counts."
@@ -96,7 +99,6 @@ class Doubt(_Row):
         "no sample lies between {gap_start_s:.0f} s and {gap_end_s:.0f} s, and the voltage does not show that the load was "
         "on. Correct the times if the clock jumped, or give a rest as samples of no current."
     )
-    CONSTANTS = "the discharges that the constants were fitted to leave it open. Fit such of other loads, or with pauses, too."
     KNEE = (
         "where the record ends, its voltage falls less steeply than that of the model. The knee of this cell may come later. "
         "Discharge further, or fit constants to this cell (fit_cell, --cell)."
@@ -137,10 +139,10 @@ class Reason(_Row):
         "The load, {load_A:.3g} A, is none of those that the constants were fitted to, {fitted} A, and they hold for these: "
         "fit discharges of this load, too."
     )
-    # faults of the samples; a stream keeps the first one in time
+    # faults of the samples, of which the first one in time is kept
     RECOVERED = (
         "The voltage comes back to that of the start at {fault_s:.0f} s, though {drawn_C:.0f} C were drawn: the cell was "
-        "charged. Reset the filter when a discharge begins."
+        "charged. Give each discharge alone; call reset() of a stream when one begins."
     )
     NOT_FOLLOWED = "The current changes by {change_A:.2f} A at {fault_s:.0f} s, and the voltage does not follow."
     RISES = "The voltage rises by {rise_V:.2f} V at {fault_s:.0f} s, where the current stays as it was."

@@ -5,7 +5,7 @@ likelihood of both, in whose units residuals are independent and of variance one
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import exp, hypot, inf, sqrt
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
 from battery_env.records import SWITCH_SHARE
-from battery_env.records.load import moment_sd_s, switched_sd_C
+from battery_env.records.load import followed_current_A, moment_sd_s, switched_charge
 
 # Real ohmic drops follow a current at once in part, where that of the model lags: this share of what lags is in doubt.
 _LATE_SHARE = 0.1
@@ -57,7 +57,7 @@ class ErrorModel:
     :param to: how late, s
     :param memory_C: the charge along which the drift loses its memory
     :param load_on_C: the charge that is in doubt between the first sample, at rest, and the second, under load
-    :param dropouts_s: spans of time in which the voltage is not that of the current, s, shape (spans, 2)
+    :param dropouts_s: spans of time since the first sample in which the voltage is not that of the current, s
     """
 
     drift_V: float = 0.0
@@ -66,7 +66,7 @@ class ErrorModel:
     to: float = 1.0
     memory_C: float = 1.0
     load_on_C: float = 0.0
-    dropouts_s: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    dropouts_s: tuple[tuple[float, float], ...] = ()
 
     def along(self, time_s: FloatArray, current_A: FloatArray) -> VoltageError:
         """
@@ -87,25 +87,24 @@ class ErrorModel:
         way = drawn_C / self.memory_C
         way += np.where(changed_A > SWITCH_SHARE * most_A, changed_A, 0.0) / most_A
         # rows may meet a load that is switched again and again at the same place each time: then these errors go together
-        together_C, alone_C = switched_sd_C(time_s, current_A)
-        together = together_C / alone_C if alone_C else 1.0
-        late_V = self.r_o * _late_sd_A(interval_s, current_A, self.to, SWITCH_SHARE * most_A, together)
-        return VoltageError(np.append(0.0, way), self.drift_V, np.hypot(noise_V, late_V))
+        switched = switched_charge(time_s, current_A)
+        together = switched.sd_C / switched.independent_sd_C if switched.independent_sd_C else 1.0
+        moment_share = np.minimum(together * moment_sd_s(interval_s) / self.to, 1.0)
+        moment_sd_A = np.where(changed_A > SWITCH_SHARE * most_A, changed_A * moment_share, 0.0)
+        # the first sample is at rest, whatever current follows it
+        late_A = _LATE_SHARE * (current_A - followed_current_A(time_s, current_A, self.to))[1:]
+        late_V = self.r_o * np.hypot(late_A, _fading(moment_sd_A, np.exp(-interval_s / self.to)))
+        return VoltageError(np.append(0.0, way), self.drift_V, np.hypot(noise_V, np.append(0.0, late_V)))
 
 
 @compiled
-def _late_sd_A(interval_s: FloatArray, current_A: FloatArray, to: float, switch_A: float, together: float) -> FloatArray:
-    # the standard deviation of the current that the ohmic drop stands for, after a first sample at rest
-    late_sd_A, followed_A, moment_sd_A = np.zeros_like(current_A), 0.0, 0.0
-    for k in range(1, len(current_A)):
-        left = exp(-interval_s[k - 1] / to)
-        followed_A = current_A[k - 1] + left * (followed_A - current_A[k - 1])
-        switched_A = abs(current_A[k] - current_A[k - 1])
-        moment_sd_A *= left
-        if switched_A > switch_A:
-            moment_sd_A = hypot(moment_sd_A, switched_A * min(together * moment_sd_s(interval_s[k - 1]) / to, 1.0))
-        late_sd_A[k] = hypot(_LATE_SHARE * (current_A[k] - followed_A), moment_sd_A)
-    return late_sd_A
+def _fading(added: FloatArray, left: FloatArray) -> FloatArray:
+    # the standard deviation of errors that are added, of which a share is left from each sample to the next
+    total, sds = 0.0, np.empty_like(added)
+    for k in range(len(added)):
+        total = hypot(left[k] * total, added[k])
+        sds[k] = total
+    return sds
 
 
 @compiled

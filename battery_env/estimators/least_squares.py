@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import hypot, isnan, nan, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,7 @@ from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_er
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimates.findings import Reason
-from battery_env.estimators.diagnosis.evidence import dropouts_s, evidence_of, measured, unseen_C
+from battery_env.estimators.diagnosis.evidence import Evidence, dropouts_of, evidence_of
 from battery_env.estimators.diagnosis.faults import MOST_NOISE_SD
 from battery_env.estimators.diagnosis.knee import knee_sd_C
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
@@ -77,7 +77,7 @@ class _Fitted:
     alone: Fit  # without the prior of q_mobile
     variance: float  # of one residual as it is weighed
     hidden_sd: Mapping[str, float]  # of what does not show in the voltage, charges that nobody saw among it, by parameter
-    evidence: Any  # what the samples show, a row of ``EVIDENCE``
+    evidence: Evidence  # what the samples show
 
     def sd(self, fit: Fit, ratios: Mapping[str, float]) -> dict[str, float]:
         """The standard deviations of a fit, so many times as large as it says, with those of what does not show."""
@@ -300,7 +300,7 @@ class LeastSquares(Estimator):
                 cell.to,
                 memory_share("forecast") * starts[0]["q_mobile"],
                 history.load_on_C,
-                dropouts_s(record, cell),
+                tuple((each.begin_s, each.end_s) for each in dropouts_of(record, cell)),
             )
         else:
             mean, covariance = self.path.moments
@@ -334,9 +334,9 @@ class LeastSquares(Estimator):
             fit = search.best([alone.values, *search.starts([mean_C])[0]], [*priors, carried])
             fit = replace(fit, spread=search.spread(fit, [*priors, carried], variance))
         evidence = self._evidence(record, history, fit)
-        return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, unseen_C(evidence)), evidence)
+        return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, evidence.unseen_C), evidence)
 
-    def _evidence(self, record: Samples, history: ChargeHistory, fit: Fit) -> Any:
+    def _evidence(self, record: Samples, history: ChargeHistory, fit: Fit) -> Evidence:
         """What the samples of a record show, with a fit."""
         estimate, soc = [fit.values[name] for name in PARAMETER_NAMES], self.initial_soc[0] if self._at_rest else None
         return evidence_of(record, self.model.cell, soc, estimate, history, _model_V(record, fit))
@@ -403,7 +403,7 @@ class LeastSquares(Estimator):
     def _verdict(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> Verdict:
         """What speaks against an estimate."""
         fit, alone, evidence, (soc, sd_soc) = fitted.fit, fitted.alone, fitted.evidence, self.initial_soc
-        diagnosis = Diagnosis(evidence, measured(evidence, soc, float(record.time_s[0]), history.charge))
+        diagnosis = Diagnosis(evidence, evidence.measured(soc, float(record.time_s[0]), history.charge))
         n, free, is_stated = len(fit.residual_V), self.parameters, self.voltage_noise_V is not None
         diagnosis.note(Reason.EMPTY, n < len(record.time_s))
         diagnosis.note(Reason.FEW, not is_stated and n < len(free) + SPARE_SAMPLES)

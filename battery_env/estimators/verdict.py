@@ -1,28 +1,21 @@
 """
 Which numbers of an estimate are settled, and why not both: one function of an estimate, its standard deviations and the
-evidence of its record, for least squares, the filter, policies and the closed form; compiled (numba), as the filter asks after
-each sample.
+evidence of its record, for all calibrators.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from math import comb, hypot, nan, sqrt
+from collections.abc import Collection, Iterator, Mapping
+from math import comb, hypot, sqrt
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from battery_env.arrays import FloatArray
-from battery_env.compiled import compiled
-from battery_env.estimates.findings import CODES, MOST_OF_SD, SETTLED_SHARES, Doubt, Finding, Reason
-from battery_env.estimators.diagnosis.evidence import (
-    EVIDENCE,
-    charges_in_doubt_C,
-    fault_reason,
-    is_smeared,
-    start_reason,
-)
-from battery_env.estimators.diagnosis.faults import RESOLUTION_V, Row, table
+from battery_env.estimates.findings import MOST_OF_SD, SETTLED_SHARES, Doubt, Finding, Reason
+from battery_env.estimators.diagnosis.evidence import Evidence
+from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.parameters import PARAMETER_NAMES
 
 #: A ``q_mobile`` is plausible within these multiples of the model cell's: its electrodes are those of a 2 Ah cell.
@@ -43,96 +36,17 @@ _EXCESS_LIMIT, _EXCESS_LIMIT_UNSTATED = 5.0, 10.0
 
 #: What is judged: both parameters, and the resistance after ten seconds, ohm.
 NUMBERS = (*PARAMETER_NAMES, "resistance_10s")
-_SHARES = (SETTLED_SHARES["q_mobile"], SETTLED_SHARES["r_o"], SETTLED_SHARES["resistance_10s"])
-#: An estimate and its verdict; what is threefold is of ``NUMBERS``: the values, their standard deviations with all
-#: that is known and by the record alone, whether they are searched for and whether they have a prior; the first reason against
-#: each, which number it names, and of one that is in doubt by what and how much; and whether the resistance is in the larger
-#: doubt.
-JUDGED = table(
-    [
-        *((name, "f8", 3) for name in ("value", "sd", "own_sd")),
-        *((name, "i8", 3) for name in ("is_searched", "has_prior", "reason")),
-        *(("about", "i8", 3), ("doubt", "i8", 3), ("in_doubt", "f8", 3)),
-        ("resistance_comes_first", "b1"),
-    ]
-)
 
 
 class Assumptions(NamedTuple):
-    """What is taken for known beside a record, and shows nowhere in its voltage."""
+    """Uncertainties that the voltage cannot reveal."""
 
     gain_sd: float = 0.0  # of the current sensor, which scales both parameters
     sd_soc: float = 0.0  # of the charge at the start, as a share of it
-    cell_sd_r_o: float = 0.0  # what the constants of the cell leave open of ``r_o``, ohm
     knee_sd_C: float = 0.0  # of the charge beyond the knee of the model
-    apart: tuple[float, float] = (0.0, 0.0)  # how far a policy is from the fit in its observation, C and ohm
+    apart: Mapping[str, float] = MappingProxyType({})  # how far a policy is from the fit in its observation, by number
     load_on_ohm: float = 0.0  # of the resistance after ten seconds, by the moment of load-on
     is_along_path: bool = False  # whether these constants lie along a path of aging cells
-
-
-@compiled
-def _note_one(judged: Row, k: int, reason: int, about: int, holds: bool) -> None:
-    # against one number: the row of the table that comes first counts
-    row = reason + 0  # a member of an enumeration is no number in older versions of numba
-    if holds and row < judged.reason[k]:
-        judged.reason[k], judged.about[k] = row, about
-
-
-@compiled
-def note(judged: Row, reason: int, holds: bool) -> None:
-    """Note a reason against all numbers, if it holds, that names none of them."""
-    note_about(judged, -1, reason, holds)
-
-
-@compiled
-def note_about(judged: Row, about: int, reason: int, holds: bool) -> None:
-    """Note one that names one number, against all, if it holds."""
-    for k in range(len(judged.reason)):
-        _note_one(judged, k, reason, about, holds)
-
-
-@compiled
-def _note_doubt(judged: Row, k: int, doubt: int, size: float) -> None:
-    # what makes most of a standard deviation
-    if size > MOST_OF_SD * judged.sd[k] and Reason.IN_DOUBT + 0 < judged.reason[k]:
-        _note_one(judged, k, Reason.IN_DOUBT, k, True)
-        judged.doubt[k], judged.in_doubt[k] = doubt + 0, size
-
-
-@compiled
-def judge(judged: Row, evidence: Row, known: Assumptions) -> None:
-    """Note what the samples of a record and the standard deviations of an estimate say against it."""
-    start, fault = start_reason(evidence), fault_reason(evidence)
-    note(judged, start, start > 0)
-    note(judged, fault, fault > 0)
-    beyond_q = beyond_r = 0.0  # in standard deviations that a settled one may have
-    for k in range(len(judged.reason)):
-        if judged.is_searched[k] == 0:
-            continue
-        sd, own_sd, most_sd, is_r = judged.sd[k], judged.own_sd[k], _SHARES[k] * judged.value[k], k > 0
-        _note_one(judged, k, Reason.PRIOR_ALONE, k, judged.has_prior[k] > 0 and not own_sd < most_sd)
-        if not sd < most_sd:
-            note(judged, Reason.MISSED, not is_r and evidence.missed_C > MOST_OF_SD * sd)
-            if is_r:
-                _note_doubt(judged, k, Doubt.DROPPED, evidence.dropped_ohm)
-                _note_doubt(judged, k, Doubt.CONSTANTS, known.cell_sd_r_o)
-                _note_doubt(judged, k, Doubt.LOAD_ON, known.load_on_ohm if k > 1 else 0.0)
-            else:
-                for number, size_C in enumerate(charges_in_doubt_C(evidence)):
-                    _note_doubt(judged, 0, number + 1, size_C)
-                _note_doubt(judged, 0, Doubt.KNEE, known.knee_sd_C)
-                _note_one(judged, 1, Reason.PATH_UNTESTED, 1, known.is_along_path)
-                _note_one(judged, 2, Reason.PATH_UNTESTED, 2, known.is_along_path)
-            _note_doubt(judged, k, Doubt.POLICY, known.apart[k] if k < 2 else 0.0)
-            scale_sd = known.gain_sd if is_r else hypot(known.gain_sd, known.sd_soc)
-            _note_one(judged, k, Reason.SCALE_UNKNOWN, k, scale_sd >= _SHARES[k])
-            _note_one(judged, k, Reason.IMPRECISE, k, True)
-        if is_r:
-            _note_doubt(judged, k, Doubt.SWITCHES, judged.value[k] if is_smeared(evidence) else 0.0)  # all of it
-            beyond_r = max(sd, own_sd) / most_sd
-        else:
-            beyond_q = max(sd, own_sd) / most_sd
-    judged.resistance_comes_first = beyond_r > beyond_q
 
 
 class Verdict(NamedTuple):
@@ -143,48 +57,46 @@ class Verdict(NamedTuple):
     findings: tuple[Finding, ...]
     settled_resistance_10s: bool
 
-    @classmethod
-    def of(cls, judged: Any, measured: Mapping[str, Any]) -> Verdict:
-        """What follows from a row of ``JUDGED``, with what was measured."""
-        found = []
-        for k, about in enumerate(judged["about"].tolist()):
-            reason, name = Reason(judged["reason"][k]), "" if about < 0 else NUMBERS[about]
-            if reason is Reason.IN_DOUBT:
-                found.append(Finding.of(Doubt(judged["doubt"][k]), name, judged["in_doubt"][k], **measured))
-            else:
-                found.append(Finding.of(reason, name, **measured))
-        settled_q_mobile, settled_r_o, settled_10s = (each.code not in CODES for each in found)
-        is_stated = bool(judged["is_searched"][2])
-        # where there is a resistance that a meter shows, that of the model need not be settled
-        of_both = [found[0], found[2 if is_stated else 1]]
-        in_order = dict.fromkeys(reversed(of_both) if judged["resistance_comes_first"] else of_both)
-        against = tuple(each for each in in_order if each.code in CODES)
-        return cls(settled_q_mobile, settled_r_o, against, settled_10s and is_stated)
+
+class _Against(NamedTuple):
+    """What speaks against a number: a reason, the number that it names, and of a doubt which one, and how much."""
+
+    reason: Reason
+    about: str = ""
+    doubt: Doubt | None = None
+    size: float = 0.0
+
+    def finding(self, measured: Mapping[str, Any]) -> Finding:
+        """As data, with what was measured."""
+        if self.doubt is None:
+            return Finding.of(self.reason, self.about, **measured)
+        return Finding.of(self.doubt, self.about, self.size, **measured)
 
 
 class Diagnosis:
     """
     What speaks against the estimate of one whole record.
 
-    :param evidence: what its samples show, a row of ``EVIDENCE``; ``None``: nothing
+    :param evidence: what its samples show; ``None``: nothing
     :param measured: what texts say of them, by the names in their braces
     """
 
-    def __init__(self, evidence: Any = None, measured: Mapping[str, Any] | None = None) -> None:
-        self._evidence = np.zeros(1, EVIDENCE)[0] if evidence is None else evidence
+    def __init__(self, evidence: Evidence | None = None, measured: Mapping[str, Any] | None = None) -> None:
+        self._evidence = Evidence() if evidence is None else evidence
         self._measured = dict(measured or {})
-        self._judged = np.zeros(1, JUDGED)[0]
-        self._judged["reason"] = Reason.SETTLED
+        reasons = (self._evidence.start, self._evidence.fault and self._evidence.fault.reason)
+        self._against = [_Against(reason) for reason in reasons if reason is not None]
 
     def note(self, reason: Reason, holds: bool = True, /, **measured: Any) -> None:
         """Note that a reason holds against all numbers, if it does, with what was measured of it."""
         if holds:
-            note(self._judged, reason, True)
+            self._against.append(_Against(reason))
             self._measured = measured | self._measured
 
     def note_about(self, number: str, reason: Reason, holds: bool = True) -> None:
         """The same of one that names one number."""
-        note_about(self._judged, NUMBERS.index(number), reason, holds)
+        if holds:
+            self._against.append(_Against(reason, number))
 
     def verdict(
         self,
@@ -198,20 +110,51 @@ class Diagnosis:
         Which numbers are settled, by their values and standard deviations as the record alone has them, of those that were
         searched for, and why not both: first why not the one that is farther beyond its limit.
         """
-        judged = self._judged
-        judged["value"] = [values.get(name, nan) for name in NUMBERS]
-        judged["sd"] = judged["own_sd"] = [sds.get(name, nan) for name in NUMBERS]
-        judged["is_searched"] = [name in searched for name in NUMBERS]
-        judged["has_prior"] = [name in priors for name in NUMBERS]
-        judge(judged, self._evidence, known or Assumptions())
-        return Verdict.of(judged, self._measured)
+        known = known or Assumptions()
+        limits = {name: SETTLED_SHARES[name] * values[name] for name in NUMBERS if name in searched}
+        is_open = "q_mobile" in limits and not sds["q_mobile"] < limits["q_mobile"]
+        against, findings = list(self._against), {}
+        if is_open and self._evidence.missed_C > MOST_OF_SD * sds["q_mobile"]:
+            against.append(_Against(Reason.MISSED))
+        for name in NUMBERS:
+            own = [_Against(Reason.PATH_UNTESTED, name)] if is_open and known.is_along_path and name != "q_mobile" else []
+            if name in limits:
+                own += self._against_one(name, values[name], sds[name], name in priors, known)
+            # the row of the table that comes first counts
+            findings[name] = min([*against, *own], key=lambda each: each.reason, default=None)
+        # where there is a resistance that a meter shows, that of the model need not be settled
+        resistance = "resistance_10s" if "resistance_10s" in limits else "r_o"
+        beyond = {name: sds[name] / limits[name] if name in limits else 0.0 for name in ("q_mobile", resistance)}
+        of_both = sorted(beyond, key=lambda name: -beyond[name])
+        in_order = dict.fromkeys(each.finding(self._measured) for name in of_both if (each := findings[name]))
+        settled_q_mobile, settled_r_o, settled_10s = (findings[name] is None for name in NUMBERS)
+        return Verdict(settled_q_mobile, settled_r_o, tuple(in_order), settled_10s and resistance == "resistance_10s")
+
+    def _against_one(self, name: str, value: float, sd: float, has_prior: bool, known: Assumptions) -> Iterator[_Against]:
+        """What its standard deviation says against a number, of those of one reason the first that counts."""
+        is_charge, share = name == "q_mobile", SETTLED_SHARES[name]
+        doubts: dict[Doubt, float] = {}
+        if not sd < share * value:
+            if is_charge:
+                doubts = {**self._evidence.charges_C, Doubt.KNEE: known.knee_sd_C}
+            elif name == "resistance_10s":
+                doubts = {Doubt.LOAD_ON: known.load_on_ohm}
+            doubts[Doubt.POLICY] = known.apart.get(name, 0.0)
+            if has_prior:
+                yield _Against(Reason.PRIOR_ALONE, name)
+            if hypot(known.gain_sd, known.sd_soc if is_charge else 0.0) >= share:
+                yield _Against(Reason.SCALE_UNKNOWN, name)
+            yield _Against(Reason.IMPRECISE, name)
+        if self._evidence.is_smeared and not is_charge:
+            doubts[Doubt.SWITCHES] = value  # all of it
+        # what makes most of a standard deviation
+        yield from (_Against(Reason.IN_DOUBT, name, doubt, size) for doubt, size in doubts.items() if size > MOST_OF_SD * sd)
 
 
-@compiled
 def is_plausible(q_mobile: float, cell_q_mobile: float) -> bool:
     """Whether a cell of the kind of the model can have some ``q_mobile``."""
     least, most = PLAUSIBLE_Q_SHARES
-    return bool(least * cell_q_mobile < q_mobile < most * cell_q_mobile)
+    return least * cell_q_mobile < q_mobile < most * cell_q_mobile
 
 
 def misfit_limit_V2(

@@ -21,9 +21,8 @@ from battery_env.checks import ZERO_CELSIUS_K, check_options
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.ends import quantile
 from battery_env.estimates import Estimate, Finding
-from battery_env.estimates.findings import Reason
-from battery_env.estimators.diagnosis.evidence import evidence_of, fault_reason, start_reason
-from battery_env.estimators.diagnosis.gaps import doubtful_C
+from battery_env.estimates.findings import Doubt, Reason
+from battery_env.estimators.diagnosis.evidence import Evidence, evidence_of
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.forecast import Forecast, forecast
@@ -150,8 +149,9 @@ def calibrated(
     end = None
     if end_is_asked or np.isfinite(sized.q_mobile):  # what has no size has no end
         end = _end(part, estimate, replace(known, method=method), model, shown, load, samples, end_is_asked)
-    charge = _charge(part, settings, estimate, end)
-    if part.start.findings or part.more_C or not _is_all_logged(part, known, shown, estimate):
+    evidence = _evidence(part, known, shown, estimate)
+    charge = _charge(part, settings, estimate, end, evidence.charges_C[Doubt.DROPPED])
+    if part.start.findings or part.more_C or not _is_all_logged(part, evidence):
         charge = dict.fromkeys(charge, float("nan"))
     nominal_Ah = _nominal_Ah(model, settings, part.load.mean_A)
     eod_s, sd_eod_s = (shown.eod_time_s, float("nan")) if end is None else _middle(end.eod_time_s, estimate)
@@ -331,13 +331,15 @@ def _middle(values: FloatArray, estimate: Estimate) -> tuple[float, float]:
     return median, (high - low) / (2.0 * _BAND_SD) if np.isfinite(estimate.sd_q_mobile) else float("nan")
 
 
-def _charge(part: _LoadedPart, settings: Settings, estimate: Estimate, end: Forecast | None) -> dict[str, float]:
+def _charge(
+    part: _LoadedPart, settings: Settings, estimate: Estimate, end: Forecast | None, dropped_C: float
+) -> dict[str, float]:
     """The columns of what was drawn, and of what a full cell would have given: its end comes at the same charge."""
     drawn_Ah, start, q_mobile = part.loaded.charge_C / 3600.0, part.start, estimate.q_mobile
     predicted_Ah, sd_Ah = (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah, settings.current_gain_sd * drawn_Ah
     if part.in_progress:
         predicted_Ah, sd_Ah = (float("nan"),) * 2 if end is None else _middle(end.capacity_Ah, estimate)
-    unseen_Ah = part.loaded.unseen_C / 3600.0
+    unseen_Ah = hypot(part.loaded.unseen_C, dropped_C) / 3600.0
     return {
         "capacity_Ah": float("nan") if part.in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": predicted_Ah,
@@ -381,17 +383,31 @@ def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cu
     return more_C
 
 
-def _is_all_logged(part: _LoadedPart, settings: Settings, forecast: VoltageForecast, estimate: Estimate) -> bool:
+def _evidence(part: _LoadedPart, settings: Settings, forecast: VoltageForecast, estimate: Estimate) -> Evidence:
+    """What the samples show beside an estimate; voltages that it does without are named."""
+    history = history_of(part.record, settings.resolved.usual_start)
+    parameters = estimate.q_mobile, estimate.r_o
+    evidence = evidence_of(Samples.of(part.record), part.cell, part.start.soc, parameters, history, forecast.at_samples_V)
+    if evidence.dropouts:
+        first_s, count = float(part.record.time_s[0]) + evidence.dropouts[0].begin_s, len(evidence.dropouts)
+        when = f"at {first_s:.0f} s" if count == 1 else f"{count} times, first at {first_s:.0f} s"
+        warnings.warn(
+            f"the current changes for a moment {when}, and the voltage does not follow: the voltages there are left out. "
+            "Check the current sensor and its logger",
+            stacklevel=5,
+        )
+    return evidence
+
+
+def _is_all_logged(part: _LoadedPart, evidence: Evidence) -> bool:
     """
     Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
     sensor fails, and the voltage says of each gap that its charge was drawn.
     """
-    record, parameters = Samples.of(part.record), (estimate.q_mobile, estimate.r_o)
-    history = history_of(part.record, settings.resolved.usual_start)
-    shown = evidence_of(record, part.cell, part.start.soc, parameters, history, forecast.at_samples_V)
     # a charge that tapered off fills any cell, whatever its voltage at rest
-    is_lower = shown["start"]["first_V"] < shown["start_V"] and not (history.charge and history.charge.tapered)
-    return not (fault_reason(shown) or (is_lower and start_reason(shown)) or doubtful_C(shown))
+    charge = part.record.history.charge
+    is_lower = evidence.first_V < evidence.start_V and not (charge and charge.tapered)
+    return not (evidence.fault or (is_lower and evidence.start) or evidence.charges_C[Doubt.GAP])
 
 
 def _nominal_Ah(model: RecordModel, settings: Settings, load_A: float) -> float:

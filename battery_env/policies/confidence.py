@@ -11,7 +11,7 @@ from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, AgingPath, cell_with
 from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Reason
-from battery_env.estimators.diagnosis.evidence import evidence_of, measured, unseen_C
+from battery_env.estimators.diagnosis.evidence import evidence_of
 from battery_env.estimators.diagnosis.faults import MOST_NOISE_SD
 from battery_env.estimators.diagnosis.rest import rest_voltage_V
 from battery_env.estimators.search import square
@@ -67,9 +67,9 @@ class Confidence:
         cell, (q_mobile, r_o), path = self._cell, estimate.tolist(), self._path
         model_V = self._model_V(fitted, n, record)
         evidence = evidence_of(record, cell, 1.0, (q_mobile, r_o), history, model_V)
-        diagnosis = Diagnosis(evidence, measured(evidence, 1.0, float(record.time_s[0]), history.charge))
+        diagnosis = Diagnosis(evidence, evidence.measured(1.0, float(record.time_s[0]), history.charge))
         apart = np.abs(fitted.estimate[n] - estimate)
-        hidden = np.hypot([unseen_C(evidence), 0.0], apart)
+        hidden = np.hypot([evidence.unseen_C, 0.0], apart)
         sd = np.hypot(fitted.sd_alone[n] * [self._sd_ratio, 1.0], hidden)
         is_measured = np.isfinite(record.voltage_V)
         residual_V = (model_V - record.voltage_V)[is_measured]  # NaN after the model is empty
@@ -93,7 +93,7 @@ class Confidence:
             if name in self._parameters:
                 diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
         values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
-        known = Assumptions(apart=(float(apart[0]), float(apart[1])), is_along_path=path is not None)
+        known = Assumptions(apart=dict(zip(PARAMETER_NAMES, apart.tolist(), strict=True)), is_along_path=path is not None)
         verdict = diagnosis.verdict(values, sds, self._parameters, known=known)
         stated = dict(zip(PARAMETER_NAMES, np.hypot(self._sd_ratio * fitted.sd[n], hidden).tolist(), strict=True))
         # the same NaN always, so that equal estimates are equal

@@ -25,7 +25,7 @@ from battery_env.records.load import (
     load_span,
     rest_current_A,
     switch_times_s,
-    switched_sd_C,
+    switched_charge,
 )
 from battery_env.records.refusals import Advice, RecordError
 from battery_env.records.samples import MILLIAMPERE, check_column, check_drawn_charge, check_samples, drawn_charge_C
@@ -158,7 +158,7 @@ class Discharge:
         history, (first, last) = self.history, self.load
         begin = max(first - 1, 0)  # a count is that of the load alone
         unknown = [slice(begin, first + 1), slice(last, last + 2)] if history.is_counted else [slice(begin, None)]
-        switched_C = [switched_sd_C(self.time_s[rows], self.current_A[rows])[0] for rows in unknown]
+        switched_C = [switched_charge(self.time_s[rows], self.current_A[rows]).sd_C for rows in unknown]
         return hypot(history.load_on_C, history.offset_A * float(np.ptp(self.time_s)), history.uncounted_C, *switched_C)
 
     @property

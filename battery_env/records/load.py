@@ -1,12 +1,12 @@
 """
 The load of a record, found once: which samples are under it, where it begins and ends, when it is switched, and the charge
-that it draws. What lies between two samples of a switch is compiled (numba).
+that it draws.
 """
 
 from __future__ import annotations
 
-from math import sqrt
-from typing import Any, NamedTuple
+from math import exp, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -189,62 +189,44 @@ def rest_current_A(current_A: FloatArray) -> float | None:
     return min(before_A, after_A, key=abs) if before_A * after_A > 0.0 else 0.0
 
 
-#: What switches have made of the charge so far: the current that was read last, and the largest one; the last switch up and
-#: the last one down, and the standard deviations by each of both and by those like it before; the variance by all others, and
-#: by all if their errors were independent; and how many there were.
-SWITCHES = np.dtype(
-    [
-        *(("read_A", "f8"), ("largest_A", "f8"), ("last_A", "f8", 2), ("like_C", "f8", 2)),
-        *(("other_C2", "f8"), ("alone_C2", "f8"), ("count", "i8")),
-    ],
-    align=True,
-)
+class SwitchedCharge(NamedTuple):
+    """What the unknown moments of switches between two samples make of a charge."""
+
+    sd_C: float
+    independent_sd_C: float  # if the error of each switch were independent of the others'
+    switches: int
 
 
-@compiled
-def moment_sd_s(interval_s: float) -> float:
+def moment_sd_s(interval_s: FloatArray) -> FloatArray:
     """The standard deviation of the moment of a switch between two samples; of near ones it is that of the second."""
-    return interval_s / sqrt(12.0) if interval_s > _EXACT_S else 0.0
+    return np.where(interval_s > _EXACT_S, interval_s / sqrt(12.0), 0.0)
+
+
+def switched_charge(time_s: FloatArray, current_A: FloatArray) -> SwitchedCharge:
+    """
+    How far the charge of a record is in doubt by the moments at which its load was switched. A load that is switched again and
+    again the same way may be met by the samples at the same place each time: then these errors add up, and others cancel in
+    part.
+    """
+    changed_A, largest_A = np.diff(current_A), np.maximum.accumulate(np.abs(current_A))[1:]
+    size_C = changed_A * moment_sd_s(np.diff(time_s))
+    is_switch = (size_C != 0.0) & (np.abs(changed_A) > SWITCH_SHARE * largest_A)
+    variance_C2 = 0.0
+    for is_alike in (changed_A > 0.0, changed_A < 0.0):
+        alike = np.flatnonzero(is_switch & is_alike)
+        switched_A = changed_A[alike]
+        is_other = np.abs(np.diff(switched_A, prepend=switched_A[:1])) > SWITCH_SHARE * np.abs(switched_A)
+        together_C = np.bincount(np.cumsum(is_other), weights=size_C[alike])
+        variance_C2 += float((together_C**2).sum())
+    single_C = size_C[is_switch]
+    return SwitchedCharge(sqrt(variance_C2), sqrt(float((single_C**2).sum())), len(single_C))
 
 
 @compiled
-def note_switch(switches: Any, read_A: float, interval_s: float) -> None:
-    """
-    Take in the current of one more sample, so long after the one before, or 0 s if nothing is in doubt. A load that is
-    switched again and again the same way may be met by the samples at the same place each time: then these errors add up, and
-    others cancel in part.
-    """
-    switched_A, switches.read_A = read_A - switches.read_A, read_A
-    switches.largest_A = max(switches.largest_A, abs(read_A))
-    moment_s = moment_sd_s(interval_s)
-    if moment_s == 0.0 or abs(switched_A) <= SWITCH_SHARE * switches.largest_A:
-        return
-    way = 0 if switched_A > 0.0 else 1
-    if abs(switched_A - switches.last_A[way]) > SWITCH_SHARE * abs(switched_A):
-        switches.other_C2 += switches.like_C[way] ** 2
-        switches.like_C[way] = 0.0
-    switches.last_A[way] = switched_A
-    switches.like_C[way] += abs(switched_A) * moment_s
-    switches.alone_C2 += (switched_A * moment_s) ** 2
-    switches.count += 1
-
-
-@compiled
-def switched_C(switches: Any) -> float:
-    """The standard deviation of the charge by the moments of all switches."""
-    return sqrt(switches.other_C2 + switches.like_C[0] ** 2 + switches.like_C[1] ** 2)
-
-
-@compiled
-def _note_all(rows: Any, time_s: FloatArray, current_A: FloatArray) -> tuple[float, float]:
-    for n in range(len(time_s)):
-        note_switch(rows[0], current_A[n], time_s[n] - time_s[max(n - 1, 0)])
-    return switched_C(rows[0]), sqrt(rows[0].alone_C2)
-
-
-def switched_sd_C(time_s: FloatArray, current_A: FloatArray) -> tuple[float, float]:
-    """
-    The standard deviation of the charge of a record by the moments at which its load was switched, C; and what it would be if
-    the error of each switch were independent of the others'.
-    """
-    return _note_all(np.zeros(1, SWITCHES), time_s, current_A)
+def followed_current_A(time_s: FloatArray, current_A: FloatArray, follows_s: float) -> FloatArray:
+    """The current that an ohmic drop stands for, which follows with a time constant after a first sample at rest."""
+    followed_A = np.zeros_like(current_A)
+    for k in range(1, len(current_A)):
+        left = exp(-(time_s[k] - time_s[k - 1]) / follows_s)
+        followed_A[k] = current_A[k - 1] + left * (followed_A[k - 1] - current_A[k - 1])
+    return followed_A

@@ -8,10 +8,10 @@ import pytest
 
 from battery_env import Discharge, calibrate, load_nasa_discharges, read_discharges
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
-from battery_env.estimators.diagnosis.evidence import evidence_of, fault_reason, unseen_C
-from battery_env.estimators.diagnosis.gaps import doubtful_C
+from battery_env.estimates.findings import Doubt
+from battery_env.estimators.diagnosis.evidence import evidence_of
 from battery_env.records import ChargeBefore, ChargeHistory, Samples
-from battery_env.records.load import switched_sd_C
+from battery_env.records.load import switched_charge
 from tests.sweeps import sweep
 
 TRUE_Q_C, TRUE_R_OHM, LOAD_A = 7000.0, 0.12, 2.0
@@ -217,7 +217,7 @@ class TestGaps:
         wander_V = 8e-4 * np.repeat(np.random.default_rng(0).choice([0.0, 1.0], 30), 12)
         record = Samples(time_s, model_V + wander_V, np.full(360, 4.4))
         seen = evidence_of(record, NEW_CELL, None, (3900.0, 0.03), ChargeHistory(), model_V)
-        assert not doubtful_C(seen) and not fault_reason(seen)
+        assert not seen.charges_C[Doubt.GAP] and seen.fault is None
 
 
 class TestSwitches:
@@ -225,11 +225,11 @@ class TestSwitches:
         """Errors of rows that meet a load at the same place each time do not cancel."""
         time_s, one_C = 10.0 * np.arange(41), 10.0 / np.sqrt(12.0)
         like = np.where(np.arange(41) // 2 % 2, 2.0, 1.0)
-        assert switched_sd_C(time_s, like) == pytest.approx(one_C * np.array([np.hypot(10.0, 10.0), np.sqrt(20.0)]))
+        assert switched_charge(time_s, like) == pytest.approx((one_C * np.hypot(10.0, 10.0), one_C * np.sqrt(20.0), 20))
         growing = 1.0 + np.cumsum(np.where(np.arange(41) % 2, 1.0, -1.0) * 1.3 ** (np.arange(41) / 4.0))
         sizes = np.abs(np.diff(growing))
-        assert switched_sd_C(time_s, growing) == pytest.approx([one_C * np.sqrt((sizes**2).sum())] * 2)
-        assert switched_sd_C(time_s, np.linspace(1.0, 2.0, 41)) == (0.0, 0.0)
+        assert switched_charge(time_s, growing)[:2] == pytest.approx([one_C * np.sqrt((sizes**2).sum())] * 2)
+        assert switched_charge(time_s, np.linspace(1.0, 2.0, 41)) == (0.0, 0.0, 0)
 
     def test_a_count_of_the_tester_leaves_none(self):
         current_A = np.where(np.arange(len(REAL.time_s)) // 3 % 2, REAL.current_A, 0.3 * REAL.current_A)
@@ -240,4 +240,4 @@ class TestSwitches:
         sure, unsure = (
             evidence_of(Samples.of(each), NEW_CELL, 1.0, (6000.0, 0.1), each.history) for each in (counted, pulsed)
         )
-        assert unseen_C(unsure) == pytest.approx(np.hypot(unseen_C(sure), pulsed.unseen_C), rel=0.01)
+        assert unsure.unseen_C == pytest.approx(np.hypot(sure.unseen_C, pulsed.unseen_C), rel=0.01)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from battery_env import NEW_CELL, Discharge, LeastSquares, Settings, fit_cell, load_nasa_discharges, simulate
-from battery_env.estimators.diagnosis.evidence import dropouts_s
+from battery_env import NEW_CELL, Discharge, LeastSquares, Settings, calibrate, fit_cell, load_nasa_discharges, simulate
+from battery_env.estimators.diagnosis.evidence import dropouts_of
 from battery_env.estimators.error import ErrorModel
 from battery_env.records import Samples
 from tests.sweeps import sweep
@@ -75,7 +75,17 @@ def test_voltages_beside_a_current_that_dropped_out_do_not_count():
     current_A = record.current_A.copy()
     current_A[1000:1015] = 0.0
     dropped = Samples(record.time_s, record.voltage_V, current_A)
-    ((begin_s, end_s),) = dropouts_s(dropped, NEW_CELL)
-    assert begin_s == 1000.0 and 1015.0 < end_s < 1040.0
+    (dropout,) = dropouts_of(dropped, NEW_CELL)
+    assert dropout.begin_s == 1000.0 and 1015.0 < dropout.end_s < 1040.0 and dropout.charge_C == pytest.approx(30.0)
     found = LeastSquares(mismatch_V=0.02).estimate(dropped)
     assert found.r_o == pytest.approx(0.15, rel=0.02) and found.q_mobile == pytest.approx(6000.0, rel=0.01)
+
+
+def test_voltages_that_are_left_out_are_named_with_their_time_and_their_charge_is_in_doubt():
+    whole = load_nasa_discharges("B0005")[60]
+    current_A = whole.current_A.copy()
+    current_A[80:83] = 0.0
+    with pytest.warns(UserWarning, match=f"changes for a moment at {whole.time_s[80]:.0f} s, and the voltage does not follow"):
+        found = calibrate(Discharge(whole.time_s, whole.voltage_V, current_A))
+    in_doubt_Ah = 2.0 * (whole.time_s[83] - whole.time_s[80]) / 3600.0
+    assert in_doubt_Ah < found.sd_predicted_capacity_Ah < 1.3 * in_doubt_Ah

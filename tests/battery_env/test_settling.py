@@ -215,7 +215,9 @@ def test_where_a_resistance_is_stated_it_counts_in_place_of_that_of_the_model():
 #: All that findings are told of, but for words; names end with units.
 MEASURED = {
     **dict.fromkeys("first_V rest_V charge_V rise_V first_A usual_A charge_A offset_A load_A change_A".split(), 0.2),
-    **dict.fromkeys("least_fitted_A most_fitted_A fault_s gap_start_s gap_end_s drawn_C moved_C missed_C".split(), 0.2),
+    **dict.fromkeys(
+        "least_fitted_A most_fitted_A fault_s dropout_s gap_start_s gap_end_s drawn_C moved_C missed_C".split(), 0.2
+    ),
     **dict.fromkeys("initial_soc switches ratio after_s step_s measured_ohm model_ohm apart_sd".split(), 0.2),
 }
 
