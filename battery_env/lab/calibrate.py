@@ -142,6 +142,7 @@ def calibrated(
     """
     is_whole = not np.isnan(discharge.eod_time_s(settings.resolved.cut_off_V))
     known, usual_C = (settings, None) if is_whole else (settings.with_nominal_cell(), settings.usual_q_mobile_C)
+    known = known.expecting()
     part = _look_at(discharge, known)
     if end_is_asked and _is_below_all_sizes(part):
         raise ValueError(Reason.BELOW_ALL_SIZES.text)
