@@ -245,7 +245,7 @@ class CellFit:
         return float(q_C.min()) * exp(-unseen_of_life(q_C)) / _GROWTH, self.q_mobile_bounds_C[1]
 
     def error_at_V(self, q_mobile_C: float) -> float:
-        """The error to expect of a discharge of some ``q_mobile``, C, in V: the farther its age is from all that were fitted."""
+        """The error to expect at some ``q_mobile``, C, in V: the larger the farther that age is from those fitted."""
         q_C = np.array([discharge.q_mobile for discharge in self.discharges])
         near_V2 = max(self.mismatch_V**2 - aged_V(unseen_of_life(q_C)) ** 2, self.rmse_V**2)
         apart = max(log(q_C.min() / q_mobile_C), log(q_mobile_C / q_C.max()), 0.0)

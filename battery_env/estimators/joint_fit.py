@@ -368,7 +368,7 @@ class JointFit:
         How far the parts of the only discharge, one for each independent error, are from constants that were fitted to its
         others (root mean square), V; to first order, and no farther than constants that were not fitted.
         """
-        n, (seen,) = len(self.sd), self._evaluated(tuple(x))
+        n = len(self.sd)
         residual, jacobian = (rows[:-n] for rows in self._objective(x, weights))
         # q_mobile and r_o are always fitted to all of a discharge
         own = jacobian[:, n:]
