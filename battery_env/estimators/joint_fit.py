@@ -90,7 +90,7 @@ def fit_cell(
     independent ones, or as many as their changes of sign. The fit estimates their variance together with the constants.
 
     *The expected error* of another discharge is the error of discharges left out of the fit: the young, the middle and the old
-    third, one after the other. Of a single discharge its parts are left out, one for each independent error. The part of a life
+    third, one after the other. Of a single discharge its parts are left out, one per independent error. The part of a life
     (:data:`LIFE_LOSS` of ``q_mobile``) and of ``q_mobile`` that no discharge covers counts in proportion to the error of the
     constants before the fit. ``mismatch_V`` holds for any age, ``error_at_V`` for one.
 
