@@ -263,4 +263,4 @@ def findings_of(rows: Iterable[Mapping[str, Any]]) -> tuple[Finding, ...]:
 def is_only_imprecise(findings: Iterable[Finding]) -> bool:
     """Return whether an estimate is not settled by its precision alone: nothing in the record contradicts it."""
     rows = [CODES[each.code] for each in findings]
-    return bool(rows) and all(isinstance(row, Reason) and row >= Reason.PRIOR_ALONE for row in rows)
+    return bool(rows) and all(row is Doubt.KNEE or (isinstance(row, Reason) and row >= Reason.PRIOR_ALONE) for row in rows)

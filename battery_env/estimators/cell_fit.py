@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from math import exp, hypot, log
+from math import exp, hypot, log, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +83,8 @@ class FittedDischarge:
     :param sd_r_o: standard deviation of ``r_o``, with the uncertainty of the constants, ohm
     :param rmse_V: root mean square of the voltage error, V
     :param rmse_before_V: the same with the constants before the fit, and the best ``q_mobile`` and ``r_o`` for them
-    :param left_out_V: the same with constants fitted without this discharge; ``None`` if there are no others
+    :param left_out_V: the same with constants fitted without this discharge, or, of a single discharge, without the part that
+        is compared; ``None`` in files of older fits
     :param current_A: mean current, A; ``None`` if the file of the fit has none
     """
 
@@ -243,12 +244,20 @@ class CellFit:
         q_C = np.array([discharge.q_mobile for discharge in self.discharges])
         return float(q_C.min()) * exp(-unseen_of_life(q_C)) / _GROWTH, self.q_mobile_bounds_C[1]
 
+    def error_at_V(self, q_mobile_C: float) -> float:
+        """The error to expect at some ``q_mobile``, C, in V: the larger the farther that age is from those fitted."""
+        q_C = np.array([discharge.q_mobile for discharge in self.discharges])
+        near_V2 = max(self.mismatch_V**2 - aged_V(unseen_of_life(q_C)) ** 2, self.rmse_V**2)
+        apart = max(log(q_C.min() / q_mobile_C), log(q_mobile_C / q_C.max()), 0.0)
+        return hypot(sqrt(near_V2), aged_V(apart))
+
     def summary(self) -> str:
         """The fit in a few lines."""
         before_V = np.sqrt(np.mean([discharge.rmse_before_V**2 for discharge in self.discharges]))
         lines = [
             f"{len(self.discharges)} discharges, voltage RMSE {1e3 * before_V:.1f} mV before, {1e3 * self.rmse_V:.1f} mV "
-            f"after; expect an error of {1e3 * self.mismatch_V:.1f} mV (mismatch_V)",
+            f"after; expect an error of {1e3 * self.error_at_V(self.cell.q_mobile):.1f} mV at these ages, of "
+            f"{1e3 * self.mismatch_V:.1f} mV over a life (mismatch_V)",
             f"a full cell rests at {rest_voltage_V(self.start):.2f} V before, at {self.full_V:.2f} V after",
             "",
             f"{'constant':<16}{'before':>12}{'after':>12}{'sd before':>12}{'after':>10}",

@@ -89,9 +89,10 @@ def fit_cell(
     *Uncertainty.* The residuals are the error of the model, and drift slowly: the residuals of a discharge count as 50
     independent ones, or as many as their changes of sign. The fit estimates their variance together with the constants.
 
-    *The expected error* of another discharge, ``mismatch_V``, is the error of discharges left out of the fit: the young, the
-    middle and the old third, one after the other. The part of a life (:data:`LIFE_LOSS` of ``q_mobile``) and of ``q_mobile``
-    that no discharge covers counts in proportion to the error of the constants before the fit.
+    *The expected error* of another discharge is the error of discharges left out of the fit: the young, the middle and the old
+    third, one after the other. Of a single discharge its parts are left out, one per independent error. The part of a life
+    (:data:`LIFE_LOSS` of ``q_mobile``) and of ``q_mobile`` that no discharge covers counts in proportion to the error of the
+    constants before the fit. ``mismatch_V`` holds for any age, ``error_at_V`` for one.
 
     *Other cells.* A cell of another capacity starts with electrodes of another size. For another chemistry the fit is as good
     as the equations; if the residuals stay large, the fit is refused. A start that is not full looks like another chemistry:
@@ -290,10 +291,7 @@ class JointFit:
         n = len(self.sd)
         residuals, derivatives = [], []
         for seen, at_rest, count in zip(self._evaluated(tuple(x)), self.at_rest, weights.independent, strict=True):
-            scale = np.full(len(seen.residual_V), np.sqrt(count / len(seen.residual_V)))
-            if at_rest:
-                scale[0] = 1.0  # one sample alone says what a full cell shows, however many follow
-            scale /= weights.mismatch_V
+            scale = _scale(len(seen.residual_V), at_rest, count) / weights.mismatch_V
             residuals.append(scale * seen.residual_V)
             derivatives.append(scale[:, None] * seen.jacobian)
         return np.concatenate([*residuals, x[:n]]), np.concatenate([*derivatives, np.eye(n, len(x))])
@@ -340,9 +338,11 @@ class JointFit:
     def _left_out_V(self, x: FloatArray, weights: _Weights) -> list[float | None]:
         """
         How far each discharge is from constants that were fitted without it, and without those of its age (root mean square),
-        V. That is what a discharge shows that nobody has fitted.
+        V. That is what a discharge shows that nobody has fitted; of one alone its parts do.
         """
         count, n = len(self.data), len(self.sd)
+        if count == 1:
+            return [self._parts_left_out_V(x, weights)]
         errors_V: list[float | None] = [None] * count
         for group, kept in groups([at.q_mobile for at in self._evaluated(tuple(x))]):
             others = JointFit(
@@ -362,6 +362,23 @@ class JointFit:
                         f"constants fitted to the other discharges cannot follow {self.names[d]}: leave it out"
                     ) from error
         return errors_V
+
+    def _parts_left_out_V(self, x: FloatArray, weights: _Weights) -> float:
+        """
+        How far the parts of the only discharge, one for each independent error, are from constants that were fitted to its
+        others (root mean square), V; to first order, and no farther than constants that were not fitted.
+        """
+        n = len(self.sd)
+        residual, jacobian = (rows[:-n] for rows in self._objective(x, weights))
+        # q_mobile and r_o are always fitted to all of a discharge
+        own = jacobian[:, n:]
+        by_constants = jacobian[:, :n] - own @ np.linalg.lstsq(own, jacobian[:, :n], rcond=None)[0]
+        covariance, left_out = np.linalg.inv(by_constants.T @ by_constants + np.eye(n)), residual.copy()
+        for part in np.array_split(np.arange(len(residual)), int(INDEPENDENT_ERRORS)):
+            shares = by_constants[part] @ covariance @ by_constants[part].T
+            left_out[part] = np.linalg.solve(np.eye(len(part)) - shares, residual[part])
+        scale = _scale(len(residual), self.at_rest[0], float(weights.independent[0]))
+        return min(_rms(weights.mismatch_V * left_out / scale), UNFITTED_MISMATCH_V)
 
     def _expected_V(self, discharges: Sequence[FittedDischarge], residual_V: float) -> float:
         """The error to expect of any discharge of the cell: of those left out, and of ages and charges that none shows."""
@@ -413,6 +430,14 @@ class JointFit:
 def _thinned(data: OnGrid) -> OnGrid:
     kept = spread_over(len(data.time_s), _MOST_SAMPLES)
     return replace(data, time_s=data.time_s[kept], voltage_V=data.voltage_V[kept])
+
+
+def _scale(samples: int, at_rest: bool, independent: float) -> FloatArray:
+    """How much the residuals of a discharge count, over what one that is independent does."""
+    scale = np.full(samples, np.sqrt(independent / samples))
+    if at_rest:
+        scale[0] = 1.0  # one sample alone says what a full cell shows, however many follow
+    return scale
 
 
 def _rms(values: FloatArray) -> float:

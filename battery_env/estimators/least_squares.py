@@ -256,7 +256,29 @@ class LeastSquares(Estimator):
         history = history_of(record, self.usual_start)
         return history if self.initial_soc[0] == 1.0 else history._replace(charge=None)
 
-    def _estimate(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> Estimate:
+    def alternatives(self, record: Record) -> list[tuple[RecordModel, float, float]]:
+        """
+        The model, ``q_mobile``, C, and ``r_o``, ohm, that fit best to a record; and those a standard deviation to each side,
+        in each direction in which all unknowns are open. A ``ValueError`` as of :meth:`estimate`.
+        """
+        samples = self._samples(record)
+        search, starts = self._search(samples)
+        fitted = self._fitted(samples, search, starts, self._history(record))
+        fit, names = fitted.fit, fitted.search.unknown
+        roots = np.linalg.cholesky(fitted.variance * np.linalg.pinv(fit.jacobian.T @ fit.jacobian, hermitian=True)).T
+        found = [fit.values]
+        found += [
+            fit.values | {n: fit.values[n] + float(move) for n, move in zip(names, row, strict=True)}
+            for row in (*roots, *-roots)
+        ]
+        (least_C, most_C), (least_ohm, most_ohm) = Q_MOBILE.limits, R_O.limits
+        return [
+            (search.model_at(at), min(max(at["q_mobile"], least_C), most_C), min(max(at["r_o"], least_ohm), most_ohm))
+            for at in found
+        ]
+
+    def _search(self, record: Samples, previous: Estimate | None = None) -> tuple[Search, list[dict[str, float]]]:
+        """The search in a record, and where to start it."""
         search = Search.of(record, self.model, self.parameters, self.nuisance, self.bounds)
         if self.path is not None:
             starts = _starts_along(self.path, search)
@@ -265,6 +287,10 @@ class LeastSquares(Estimator):
         else:
             search = search.until_empty()
             starts = search.starts([self.model.cell.q_mobile])[0]
+        return search, starts
+
+    def _estimate(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> Estimate:
+        search, starts = self._search(record, previous)
         fitted = self._fitted(record, search, starts, history)
         sd = fitted.sd(fitted.fit, dict.fromkeys(self.parameters, self._sd_ratio))
         resistance = self._resistance(record, history, fitted, fitted.fit)

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from math import hypot
+from math import hypot, sqrt
 from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple, overload
@@ -139,6 +139,7 @@ def calibrated(
     is_whole = not np.isnan(discharge.eod_time_s(settings.resolved.cut_off_V))
     known, usual_C = (settings, None) if is_whole else (settings.with_nominal_cell(), settings.usual_q_mobile_C)
     part = _look_at(discharge, known)
+    known = known.expecting(mean_current_A(part.record))
     if end_is_asked and _is_below_all_sizes(part):
         raise ValueError(Reason.BELOW_ALL_SIZES.text)
     estimate, method, model = _estimate(part, known, usual_C)
@@ -276,10 +277,11 @@ def _end(
         return None
     if settings.prior_q_mobile_C is None and settings.fit is not None:
         estimate = estimate.within(*settings.fit.life_q_mobile_C)
+    gain_sd = settings.current_gain_sd
     try:
         end = forecast(
             part.record,
-            estimate,
+            _as_read(estimate, gain_sd),
             load,
             settings.resolved.cut_off_V,
             model=model,
@@ -291,11 +293,23 @@ def _end(
         if is_asked:
             raise
         return None
+    gains = 1.0 + gain_sd * np.random.default_rng(0).standard_normal(samples)
+    end = replace(end, q_mobile=gains * end.q_mobile, capacity_Ah=gains * end.capacity_Ah)
+    end = replace(end, r_o=end.r_o / gains, resistance_10s_ohm=end.resistance_10s_ohm / gains)
     load_A = part.load.mean_A if load is None else _largest_A(load, settings.resolved.cut_off_V)
     # a cell of which nothing is known has no health
     is_known = settings.nominal_Ah is not None or settings.tells_new_capacity(load_A)
     notes = (*end.notes, *_notes(part, estimate, settings, shown, load_A))
     return replace(end, nominal_Ah=end.nominal_Ah if is_known else float("nan"), notes=notes)
+
+
+def _as_read(estimate: Estimate, gain_sd: float) -> Estimate:
+    """In units of the current sensor, whose gain cancels from an end: the load to come is what it will read."""
+    left_C2, left_ohm2 = (
+        max(sd**2 - (gain_sd * value) ** 2, 0.0)
+        for value, sd in ((estimate.q_mobile, estimate.sd_q_mobile), (estimate.r_o, estimate.sd_r_o))
+    )
+    return replace(estimate, sd_q_mobile=sqrt(left_C2), sd_r_o=sqrt(left_ohm2))
 
 
 def _notes(part: _LoadedPart, estimate: Estimate, settings: Settings, shown: VoltageForecast, load_A: float) -> Iterator[str]:

@@ -27,9 +27,10 @@ from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.settings import Settings
-from battery_env.loads import Load, LoadToCome
+from battery_env.loads import Load, LoadToCome, constant
 from battery_env.records import VARIED_SHARE, DischargeStart, drawn, drawn_charge_C, mean_current_A
 from battery_env.records.discharge import Discharge
+from battery_env.records.model import RecordModel
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
@@ -63,6 +64,9 @@ class Life:
     :param covariance: covariance of ``state``, shape (2, 2)
     :param sd_share: relative standard deviation of the last valid ``q_mobile`` with uncertain constants; or NaN
     :param usual_start: how the discharges start; ``None`` if they do not start and last alike
+    :param cut_off_V: cut-off voltage of the discharges, V
+    :param alternatives: the model of the last valid discharge, and others that its constants leave open
+        (:meth:`battery_env.LeastSquares.alternatives`)
     """
 
     table: pd.DataFrame
@@ -73,6 +77,8 @@ class Life:
     covariance: FloatArray
     sd_share: float = nan
     usual_start: DischargeStart | None = None
+    cut_off_V: float = nan
+    alternatives: Sequence[tuple[RecordModel, float, float]] = ()
 
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
@@ -83,14 +89,34 @@ class Life:
         """
         return self._prior_C(1)
 
-    def _prior_C(self, count: int, at_other_loads: bool = False) -> tuple[float, float]:
-        """The prior of so many discharges later, at the load of the life or at others."""
+    def _prior_C(self, count: int, other_A: float | None = None) -> tuple[float, float]:
+        """The prior of so many discharges later, at the load of the life or at another one, A; NaN: at any."""
         mean_C, sd_C = self.later_q_mobile_C(count)
-        if at_other_loads:
-            return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * self.sd_share)
+        if other_A is not None:
+            return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * hypot(self.sd_share, self._open_share(other_A)))
         whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
         lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
         return lasted * mean_C, lasted * sd_C
+
+    def _open_share(self, load_A: float) -> float:
+        """What the constants leave open of the charge under a load, over that under the load of the life, as a share of it."""
+        if not load_A > 0.0 or not self.alternatives:
+            return 0.0
+        loads = [constant(each_A, "current") for each_A in (load_A, self._usual_A)]
+        given_Ah = np.array(
+            [
+                [float(model.capacity_Ah([load], self.cut_off_V, q_mobile, r_o)[0]) for load in loads]
+                for model, q_mobile, r_o in self.alternatives
+            ]
+        )
+        share = given_Ah[:, 0] / given_Ah[:, 1]
+        # both sides of each direction; no more than all of it
+        apart = (share[1:] - share[0]) / np.maximum(share[1:], share[0])
+        return sqrt(0.5 * float(np.nansum(apart**2)))
+
+    @property
+    def _usual_A(self) -> float:
+        return float(self.table["mean_current_A"][self.table["valid"]].iloc[-1])
 
     @property
     def next_q_mobile_C(self) -> tuple[float, float]:
@@ -106,7 +132,7 @@ class Life:
     @property
     def prior_at_other_loads_C(self) -> tuple[float, float]:
         """The same for a load that is not that of the life: the error that all estimates share counts too, in full."""
-        return self._prior_C(1, at_other_loads=True)
+        return self._prior_C(1, nan)
 
     def discharges_until(self, cycle: int | None) -> int:
         """How many discharges after the last one of the life that of a number is; 1 where the numbers do not tell."""
@@ -122,17 +148,15 @@ class Life:
         :param load: to come, as :func:`battery_env.forecast` takes it; ``None``: as so far
         :return: mean and standard deviation of ``q_mobile``, C
         """
-        if isinstance(load, Load) and load.unit == "current":
-            to_come_A = load.value.tolist()
-        elif load is None or isinstance(load, Real):
-            to_come_A = [] if load is None else [float(load)]
-        else:
-            return self._prior_C(self.discharges_until(running.meta.get("cycle")), at_other_loads=True)
-        usual_A = self.table["mean_current_A"][self.table["valid"]].iloc[-1]
+        is_known = load is None or isinstance(load, Real) or (isinstance(load, Load) and load.unit == "current")
+        to_come_A = load.value.tolist() if isinstance(load, Load) else [float(load)] if isinstance(load, Real) else []
         so_far_A = np.quantile(running.current_A[running.time_s > running.load_on_time_s], [0.05, 0.95])
-        currents_A = [usual_A, *so_far_A, *to_come_A]
-        is_usual = np.ptp(currents_A) <= VARIED_SHARE * max(currents_A)
-        return self._prior_C(self.discharges_until(running.meta.get("cycle")), at_other_loads=not is_usual)
+        currents_A = np.array([*so_far_A, *(to_come_A if is_known else [])])
+        ratios = np.maximum(currents_A, 0.0) / self._usual_A
+        is_usual = np.ptp([1.0, *ratios]) <= VARIED_SHARE * max(1.0, *ratios)
+        farthest = int(np.argmax(np.maximum(ratios, 1.0 / np.maximum(ratios, VARIED_SHARE))))
+        other_A = None if is_known and is_usual else float(currents_A[farthest])
+        return self._prior_C(self.discharges_until(running.meta.get("cycle")), other_A)
 
     def after(self, count: int) -> Life:
         """
@@ -144,7 +168,8 @@ class Life:
         """
         if not 1 <= check_whole_number("count", count) <= len(self.table):
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
-        return replace(life_of(self.table.iloc[:count]), sd_share=self.sd_share, usual_start=self.usual_start)
+        kept = ("sd_share", "usual_start", "cut_off_V", "alternatives")
+        return replace(life_of(self.table.iloc[:count]), **{name: getattr(self, name) for name in kept})
 
     def remaining_discharges(self, threshold_Ah: float, probability: ArrayLike = BAND) -> FloatArray:
         """
@@ -249,8 +274,10 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
     texts = [{"reason": reason_of(row["findings"])} for row in rows]
     life = life_of(pd.DataFrame([row | text for row, text in zip(rows, texts, strict=True)], columns=_COLUMNS))
     last = discharges[int(np.flatnonzero(life.table["valid"])[-1])]
-    estimate = unsure.estimate(last.loaded_part(cut_off_V))
-    return replace(life, sd_share=estimate.sd_q_mobile / estimate.q_mobile, usual_start=usual_start)
+    record = last.loaded_part(cut_off_V)
+    estimate, alternatives = unsure.estimate(record), unsure.alternatives(record)
+    sd_share = estimate.sd_q_mobile / estimate.q_mobile
+    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=alternatives)
 
 
 def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> DischargeStart | None:
@@ -273,6 +300,8 @@ def _row_of(discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: 
     end_s = held.model.forecast(record, estimate, cut_off_V).eod_time_s
     capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
+    # what leaves the resistance in doubt is no doubt of q_mobile
+    of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]
     return {
         "q_mobile_C": estimate.q_mobile,
         "sd_q_mobile_C": estimate.sd_q_mobile,
@@ -283,7 +312,7 @@ def _row_of(discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: 
         "r_o_ohm": estimate.r_o,
         "settled": estimate.settled,
         "findings": estimate.findings,
-        "valid": estimate.settled or (not isnan(measured_s) and is_only_imprecise(estimate.findings)),
+        "valid": estimate.settled_q_mobile or (not isnan(measured_s) and is_only_imprecise(of_charge)),
         "capacity_Ah": capacity_Ah,
         "mean_current_A": mean_current_A(record),
         "lasted_share": (measured_s - start_s) / (end_s - start_s),

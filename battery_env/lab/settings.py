@@ -138,6 +138,15 @@ class Settings:
         """The same with other settings; what nobody stated of another cell is what that one tells."""
         return replace(self, **others)
 
+    def expecting(self, current_A: float) -> Settings:
+        """
+        With the error to expect at the age that a prior tells, under a mean current that constants were fitted to, where no
+        error is stated.
+        """
+        if self.fit is None or self.mismatch_V is not None or self.prior_q_mobile_C is None or self.other_load(current_A):
+            return self
+        return replace(self, mismatch_V=self.fit.error_at_V(self.prior_q_mobile_C[0]))
+
     @property
     def constants(self) -> CellParameters:
         """Of the model."""

@@ -335,8 +335,9 @@ class TestCommand:
         assert "notes.txt is left out" in shown.err
         written = terminal.row("forecast", "run_2.5A.csv", "--life", "lab", "--load", "profile.csv")
         life = track_life(self.discharges[:10], 2.7)
-        # another load than that of the life
-        assert written["prior_q_mobile_C"] == pytest.approx(life.prior_at_other_loads_C, rel=1e-6)
+        # another load than that of the life, up to 3 A
+        prior_C = life.prior_for(self.discharges[10].until(1200.0), read_load("profile.csv"))
+        assert written["prior_q_mobile_C"] == pytest.approx(prior_C, rel=1e-6)
         known = Settings(prior_q_mobile_C=tuple(written["prior_q_mobile_C"]))
         seen = self.discharges[10].until(1200.0)
         again = forecast_end(seen, known, read_load("profile.csv"))
@@ -377,9 +378,22 @@ class TestCommand:
         life, running = track_life(self.discharges[:10], 2.7), self.discharges[10].until(1200.0)
         own, other = life.prior_q_mobile_C, life.prior_at_other_loads_C
         assert own[1] < other[1]
-        loads = {None: own, 2.0: own, 1.5: other, constant(2.0, "current"): own, constant(8.0, "power"): other}
-        assert [life.prior_for(running, load) for load in loads] == list(loads.values())
-        assert life.prior_for(running, read_load("profile.csv")) == life.prior_for(running, lambda time_s: 2.0) == other
+        loads = {None: own, 2.0: own, constant(2.0, "current"): own, constant(8.0, "power"): other}
+        for load, expected in loads.items():
+            assert life.prior_for(running, load) == pytest.approx(expected, rel=1e-3)
+        assert life.prior_for(running, lambda time_s: 2.0) == pytest.approx(other, rel=1e-3)
+
+    def test_the_farther_a_load_is_from_that_of_the_life_the_less_its_constants_tell(self):
+        life, running = track_life(self.discharges[:3], 2.7), self.discharges[10].until(1200.0)
+        for loads_A in ((2.5, 4.0, 8.0), (1.5, 0.5, 0.1)):
+            sds_C = [life.prior_for(running, load_A)[1] for load_A in loads_A]
+            assert life.prior_at_other_loads_C[1] < sds_C[0] < sds_C[1] < sds_C[2]
+
+    def test_the_gain_of_the_current_sensor_cancels_from_the_end_and_not_from_the_charge(self):
+        life, running = track_life(self.discharges[:10], 2.7), self.discharges[10].until(1200.0)
+        sound, scaled = (forecast_end(running, Settings(current_gain_sd=sd), life=life) for sd in (0.0, 0.02))
+        assert np.ptp(scaled.eod_quantile_s()) == pytest.approx(np.ptp(sound.eod_quantile_s()), rel=0.02)
+        assert np.std(scaled.q_mobile / scaled.q_mobile.mean()) > 0.018 > 1.5 * np.std(sound.q_mobile / sound.q_mobile.mean())
 
     def test_a_sparse_life_is_as_unsure_as_the_fade_and_says_so(self, terminal):
         running = load_nasa_discharges("B0006")[79]
