@@ -5,6 +5,7 @@ evidence of its record, for all calibrators.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Collection, Iterator, Mapping
 from math import comb, hypot, sqrt
 from types import MappingProxyType
@@ -124,8 +125,11 @@ class Diagnosis:
             findings[name] = min([*against, *own], key=lambda each: each.reason, default=None)
         # where there is a resistance that a meter shows, that of the model need not be settled
         resistance = "resistance_10s" if "resistance_10s" in limits else "r_o"
-        beyond = {name: sds[name] / limits[name] if name in limits else 0.0 for name in ("q_mobile", resistance)}
-        of_both = sorted(beyond, key=lambda name: -beyond[name])
+        # a resistance of 0 is as far beyond its limit as can be
+        beyond = {
+            name: sds[name] / max(limits[name], sys.float_info.min) for name in ("q_mobile", resistance) if name in limits
+        }
+        of_both = sorted(("q_mobile", resistance), key=lambda name: -beyond.get(name, 0.0))
         in_order = dict.fromkeys(each.finding(self._measured) for name in of_both if (each := findings[name]))
         settled_q_mobile, settled_r_o, settled_10s = (findings[name] is None for name in NUMBERS)
         return Verdict(settled_q_mobile, settled_r_o, tuple(in_order), settled_10s and resistance == "resistance_10s")
