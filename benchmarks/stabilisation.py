@@ -139,9 +139,9 @@ _NOISE = {"noise_type": "normal", "noise_std": 0.1}
 #: Who is judged, by the name on the command line.
 CONTENDERS = {
     "lac": Contender("lac", "LAC", COLOUR_OF["LAC"], "o", compiles=True),
-    "lac_as_typed": Contender("lac", "LAC, as typed", COLOUR_OF["LAC"], "p", compiles=True, typed=True),
+    "lac_as_typed": Contender("lac", "LAC, as typed", COLOUR_OF["LAC"], "<", compiles=True, typed=True),
     "lac_default_root": Contender(
-        "lac", "LAC, its default root", COLOUR_OF["LAC"], "h", hyperparameters=_NETWORKS, compiles=True
+        "lac", "LAC, its default root", COLOUR_OF["LAC"], "*", hyperparameters=_NETWORKS, compiles=True
     ),
     "lac_square_root": Contender("lac", "LAC (root=2)", COLOUR_OF["LAC"], "d", hyperparameters=_SQUARE_ROOT, compiles=True),
     "published_lac": Contender("published_lac", "LAC as published", COLOUR_OF["LAC as published"], "P", compiles=True),
