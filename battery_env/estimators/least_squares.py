@@ -97,6 +97,14 @@ class _Resistance(NamedTuple):
     load_on_ohm: float = 0.0
 
 
+class Alternative(NamedTuple):
+    """A cell that a record leaves open: its model, ``q_mobile``, C, and ``r_o``, ohm."""
+
+    model: RecordModel
+    q_mobile: float
+    r_o: float
+
+
 class LeastSquares(Estimator):
     """
     The (q_mobile, r_o) whose simulated voltage is closest to the recorded voltage, over all samples of the record.
@@ -256,10 +264,10 @@ class LeastSquares(Estimator):
         history = history_of(record, self.usual_start)
         return history if self.initial_soc[0] == 1.0 else history._replace(charge=None)
 
-    def alternatives(self, record: Record) -> list[tuple[RecordModel, float, float]]:
+    def alternatives(self, record: Record) -> list[Alternative]:
         """
-        The model, ``q_mobile``, C, and ``r_o``, ohm, that fit best to a record; and those a standard deviation to each side,
-        in each direction in which all unknowns are open. A ``ValueError`` as of :meth:`estimate`.
+        The cell that fits best to a record; and those a standard deviation to each side, in each direction in which all
+        unknowns are open. A ``ValueError`` as of :meth:`estimate`.
         """
         samples = self._samples(record)
         search, starts = self._search(samples)
@@ -273,7 +281,9 @@ class LeastSquares(Estimator):
         ]
         (least_C, most_C), (least_ohm, most_ohm) = Q_MOBILE.limits, R_O.limits
         return [
-            (search.model_at(at), min(max(at["q_mobile"], least_C), most_C), min(max(at["r_o"], least_ohm), most_ohm))
+            Alternative(
+                search.model_at(at), min(max(at["q_mobile"], least_C), most_C), min(max(at["r_o"], least_ohm), most_ohm)
+            )
             for at in found
         ]
 

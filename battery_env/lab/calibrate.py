@@ -293,7 +293,8 @@ def _end(
         if is_asked:
             raise
         return None
-    gains = 1.0 + gain_sd * np.random.default_rng(0).standard_normal(samples)
+    # a stream of its own: the draws of the forecast have the seed 0
+    gains = 1.0 + gain_sd * np.random.default_rng([0, 1]).standard_normal(samples)
     end = replace(end, q_mobile=gains * end.q_mobile, capacity_Ah=gains * end.capacity_Ah)
     end = replace(end, r_o=end.r_o / gains, resistance_10s_ohm=end.resistance_10s_ohm / gains)
     load_A = part.load.mean_A if load is None else _largest_A(load, settings.resolved.cut_off_V)

@@ -348,7 +348,8 @@ def _calibrate_all(
 ) -> int:
     states: Counter[str] = Counter()
     cells: Counter[str] = Counter()
-    ends: list[Calibration] = []  # the first and the last that are settled
+    first_settled: Calibration | None = None
+    last_settled: Calibration | None = None
     first: Outcome | None = None
     is_interrupted = False
     if results and results.spoiled:
@@ -369,7 +370,7 @@ def _calibrate_all(
                 states[outcome.state] += 1
                 cells[outcome.cell] += 1
                 if outcome.found and outcome.found.settled:
-                    ends = [*ends[:1], outcome.found]
+                    first_settled, last_settled = first_settled or outcome.found, outcome.found
     except KeyboardInterrupt:
         print("interrupted: what is done is kept" + (", and the same command goes on" if results else ""), file=sys.stderr)
         is_interrupted = True
@@ -381,8 +382,10 @@ def _calibrate_all(
         if states.total() > 1:
             counts = ", ".join(f"{states[state]} {state}" for state in ("settled", "not settled", "refused"))
             print(f"\n{states.total()} discharges: {counts}")
-            if len(ends) > 1 and len(cells) in (1, states.total()):  # a file each is one cell's, as in life.png
-                print(f"{change_of(*ends)}, {states['settled']} of {states.total()} settled")
+            is_one_cell = len(cells) in (1, states.total())  # a file each is one cell's, as in life.png
+            if is_one_cell and first_settled and last_settled and last_settled is not first_settled:
+                change = change_of(first_settled, last_settled)
+                print(f"{change}, {states['settled']} of {states.total()} settled")
         elif first and first.found:
             print(text_of(first.record, first.found))
         if results and results.has_numbers:

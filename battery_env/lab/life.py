@@ -24,13 +24,12 @@ from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
-from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.least_squares import Alternative, LeastSquares
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.records import VARIED_SHARE, DischargeStart, drawn, drawn_charge_C, mean_current_A
 from battery_env.records.discharge import Discharge
-from battery_env.records.model import RecordModel
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
 #: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
@@ -78,7 +77,7 @@ class Life:
     sd_share: float = nan
     usual_start: DischargeStart | None = None
     cut_off_V: float = nan
-    alternatives: Sequence[tuple[RecordModel, float, float]] = ()
+    alternatives: Sequence[Alternative] = ()
 
     @property
     def prior_q_mobile_C(self) -> tuple[float, float]:
@@ -105,8 +104,8 @@ class Life:
         loads = [constant(each_A, "current") for each_A in (load_A, self._usual_A)]
         given_Ah = np.array(
             [
-                [float(model.capacity_Ah([load], self.cut_off_V, q_mobile, r_o)[0]) for load in loads]
-                for model, q_mobile, r_o in self.alternatives
+                [float(each.model.capacity_Ah([load], self.cut_off_V, each.q_mobile, each.r_o)[0]) for load in loads]
+                for each in self.alternatives
             ]
         )
         share = given_Ah[:, 0] / given_Ah[:, 1]
