@@ -20,7 +20,7 @@ from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
@@ -92,7 +92,7 @@ class Life:
         """The prior of so many discharges later, at the load of the life or at another one, A; NaN: at any."""
         mean_C, sd_C = self.later_q_mobile_C(count)
         if other_A is not None:
-            return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * hypot(self.sd_share, self._open_share(other_A)))
+            return mean_C, hypot(sd_C, mean_C * UNFITTED_ERROR_RATIO * hypot(self.sd_share, self._open_share(other_A)))
         whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
         lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
         return lasted * mean_C, lasted * sd_C

@@ -8,7 +8,7 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
-from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, AgingPath, cell_with
+from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, PATH_DISTANCE_LIMIT_SD, AgingPath, cell_with
 from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Reason
 from battery_env.estimators.diagnosis.evidence import evidence_of
@@ -82,7 +82,7 @@ class Confidence:
         diagnosis.note(Reason.FEW, readings < len(self._parameters) + SPARE_SAMPLES)
         limit_V2 = misfit_limit_V2(white_V, readings, mismatch_V, negligible_V=_LINEAR_STEP_V)
         diagnosis.note(Reason.MISFIT, not square(residual_V) <= readings * limit_V2)
-        most_sd = REACH_SD if path is None else BESIDE_LIMIT_SD
+        most_sd = REACH_SD if path is None else PATH_DISTANCE_LIMIT_SD
         for what, size, most in (
             ("distance from the constants that it has learned of", float(fitted.constants_sd[n]), most_sd),
             ("offset of the voltage", abs(float(fitted.offset_V[n])), MISMATCH_MARGIN * self._offset_V),

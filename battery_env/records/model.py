@@ -26,7 +26,7 @@ from battery_env.electrochemistry import (
     simulate,
 )
 from battery_env.electrochemistry.aging_path import cell_with
-from battery_env.electrochemistry.ends import LONGEST_S, Cells, ToCome, run_down
+from battery_env.electrochemistry.ends import LONGEST_S, Cells, FutureLoad, simulate_to_cut_off
 from battery_env.electrochemistry.tangents import TANGENT_NAMES, PolynomialDerivatives, least_q_mobile, roll_out_with_tangents
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE, R_O
@@ -254,7 +254,7 @@ class RecordModel:
         )
 
     def capacity_Ah(
-        self, loads: Sequence[ToCome], cut_off_V: float, q_mobile: ArrayLike | None = None, r_o: ArrayLike | None = None
+        self, loads: Sequence[FutureLoad], cut_off_V: float, q_mobile: ArrayLike | None = None, r_o: ArrayLike | None = None
     ) -> FloatArray:
         """
         The charge that cells give from full down to the cut-off; what a load charges first comes on top.
@@ -270,7 +270,7 @@ class RecordModel:
         q_C, r_ohm, _ = (np.array(each) for each in np.broadcast_arrays(q_C, r_ohm, np.empty(len(loads))))
         as_model = np.zeros(len(q_C))
         full = Cells(q_C, r_ohm, initial_state(q_C, self.cell), as_model, as_model)
-        return run_down(full, self, loads, cut_off_V, surplus_share=np.inf).capacity_Ah
+        return simulate_to_cut_off(full, self, loads, cut_off_V, surplus_share=np.inf).capacity_Ah
 
     def sensitivities(
         self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int = 1
