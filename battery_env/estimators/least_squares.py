@@ -370,20 +370,20 @@ class LeastSquares(Estimator):
             fit = search.best([alone.values, *search.starts([mean_C])[0]], [*priors, carried])
             fit = replace(fit, spread=search.spread(fit, [*priors, carried], variance))
         evidence = self._evidence(record, history, fit)
-        return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, evidence.unseen_C), evidence)
+        return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, evidence.sd_charge_C), evidence)
 
     def _evidence(self, record: Samples, history: ChargeHistory, fit: Fit) -> Evidence:
         """What the samples of a record show, with a fit."""
         estimate, soc = [fit.values[name] for name in PARAMETER_NAMES], self.initial_soc[0] if self._at_rest else None
         return evidence_of(record, self.model.cell, soc, estimate, history, _model_V(record, fit))
 
-    def _hidden_sd(self, search: Search, fit: Fit, unseen_C: float) -> dict[str, float]:
+    def _hidden_sd(self, search: Search, fit: Fit, sd_charge_C: float) -> dict[str, float]:
         """
         The standard deviations of what does not show in the voltage: the gain of the current sensor, which scales both
         parameters, and the charge at the start, which the fit makes up for. A charge that nobody saw is like one of these.
         """
         (soc, sd_soc), values, model = self.initial_soc, fit.values, self.model
-        sd_soc = hypot(sd_soc, unseen_C / values["q_mobile"])
+        sd_soc = hypot(sd_soc, sd_charge_C / values["q_mobile"])
         by_soc = np.zeros(len(search.unknown))
         if sd_soc:
             step = _SOC_STEP if soc < 0.5 else -_SOC_STEP

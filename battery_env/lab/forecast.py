@@ -294,7 +294,7 @@ def _to_come(
     """The load to come, and its name."""
     if load is None:
         expected = expected_current(record.time_s, record.current_A)
-        if expected.varied:
+        if expected.is_varying:
             return BlockBootstrap(record, steadier_unit(record), dt_s=model.dt_s), "a load as so far"
         load, unit = expected.mean_A, "current"
     if isinstance(load, RandomLoad):

@@ -28,7 +28,7 @@ from battery_env.estimators.least_squares import Alternative, LeastSquares
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
-from battery_env.records import VARIED_SHARE, DischargeStart, drawn, drawn_charge_C, mean_current_A
+from battery_env.records import VARIED_SHARE, DischargeStart, drawn_charge_C, integrate_load, mean_current_A
 from battery_env.records.discharge import Discharge
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
@@ -297,7 +297,7 @@ def _row_of(discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: 
     estimate = held.estimate(record)
     of_its_own = estimate if held.nuisance == unsure.nuisance else unsure.estimate(record)
     end_s = held.model.forecast(record, estimate, cut_off_V).eod_time_s
-    capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
+    capacity_Ah = float(integrate_load(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
     # what leaves the resistance in doubt is no doubt of q_mobile
     of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]

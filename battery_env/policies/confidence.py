@@ -69,7 +69,7 @@ class Confidence:
         evidence = evidence_of(record, cell, 1.0, (q_mobile, r_o), history, model_V)
         diagnosis = Diagnosis(evidence, evidence.measured(1.0, float(record.time_s[0]), history.charge))
         apart = np.abs(fitted.estimate[n] - estimate)
-        hidden = np.hypot([evidence.unseen_C, 0.0], apart)
+        hidden = np.hypot([evidence.sd_charge_C, 0.0], apart)
         sd = np.hypot(fitted.sd_alone[n] * [self._sd_ratio, 1.0], hidden)
         is_measured = np.isfinite(record.voltage_V)
         residual_V = (model_V - record.voltage_V)[is_measured]  # NaN after the model is empty

@@ -63,7 +63,7 @@ class Evidence:
     is_smeared: bool = False
 
     @property
-    def unseen_C(self) -> float:
+    def sd_charge_C(self) -> float:
         """The standard deviation of the charge by all that nobody saw, and that steps of the voltage show."""
         return sqrt(sum((charge_C**2 for charge_C in self.charges_C.values()), self.missed_C**2))
 
@@ -128,7 +128,7 @@ def evidence_of(
             Doubt.LOAD_ON: rest.load_on_C,
             Doubt.REST_CURRENT: rest.charge_C,
             Doubt.CHARGE_LEFT: expected.left_C(first_V, cell.q_mobile),
-            Doubt.UNCOUNTED: history.uncounted_C,
+            Doubt.UNCOUNTED: history.sd_counter_C,
             Doubt.DROPPED: sum(each.charge_C for each in response.dropouts),
             Doubt.SWITCHES: 0.0 if history.is_counted else switched.sd_C,
             Doubt.GAP: gaps.doubt_C,
@@ -178,9 +178,9 @@ class _ExpectedStart:
         expected = cls(rest_V, low_rest_voltage_V(cell, initial_soc), rest_V + ABOVE_REST_V)
         if charge is not None:
             # without a rest a charge that did not taper off tells nothing but that the cell is lower
-            is_low = charge.highest_V < expected.low_V or (not charge.tapered and history.rest_s < STEADY_S)
-            expected.is_full = False if is_low else charge.tapered or None
-            expected.charge_left_C, expected.is_cut_short = charge.left_C, not charge.tapered
+            is_low = charge.highest_V < expected.low_V or (not charge.is_tapered and history.rest_s < STEADY_S)
+            expected.is_full = False if is_low else charge.is_tapered or None
+            expected.charge_left_C, expected.is_cut_short = charge.taper_remainder_C, not charge.is_tapered
         if history.start is not None and history.usual_start is not None:
             expected._take_usual(history.start, history.usual_start)
         return expected
@@ -198,7 +198,7 @@ class _ExpectedStart:
         spread_V = MOST_NOISE_SD * usual.sd_V
         self.low_V, self.high_V = usual.voltage_V - span_V - spread_V, usual.voltage_V + ABOVE_REST_V + spread_V
         if own.charge is not None:
-            is_low, is_full = own.charge.highest_V < self.low_V, own.charge.tapered and is_like is not False
+            is_low, is_full = own.charge.highest_V < self.low_V, own.charge.is_tapered and is_like is not False
             self.is_full = False if is_low else is_full or None
 
     def left_C(self, first_V: float, cell_q_mobile: float) -> float:

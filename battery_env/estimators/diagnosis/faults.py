@@ -17,7 +17,7 @@ from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import NEW_CELL
 from battery_env.estimates.findings import Reason
 from battery_env.records import REST_CURRENT_A, STEADY_S, SWITCH_SHARE, Samples
-from battery_env.records.load import followed_current_A
+from battery_env.records.load import lagged_current_A
 
 #: A voltage farther off than so many standard deviations of its noise shows an error of the model, or of the sensor.
 MOST_NOISE_SD = 3.0
@@ -135,7 +135,7 @@ class MeasuredSamples:
 
     @cached_property
     def _followed_A(self) -> FloatArray:
-        return followed_current_A(self.time_s, self.current_A, _FOLLOWS_S)
+        return lagged_current_A(self.time_s, self.current_A, _FOLLOWS_S)
 
     def noise_V(self, n: int) -> float:
         """What is more than noise, by the changes of the voltage up to a sample; infinite if these are too few to tell."""

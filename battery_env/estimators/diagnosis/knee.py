@@ -6,7 +6,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyfit
 
 from battery_env.arrays import FloatArray
-from battery_env.records import CUT_OFF_V, SWITCH_SHARE, Samples, drawn, is_load
+from battery_env.records import CUT_OFF_V, SWITCH_SHARE, Samples, integrate_load, is_load
 
 # The end of a record: this share of the charge that was drawn, and at least so many samples.
 _END_SHARE, _LEAST_SAMPLES = 0.05, 5
@@ -22,7 +22,7 @@ def knee_sd_C(record: Samples, model_V: FloatArray, empty_V: float) -> float:
     :param model_V: voltage of the fitted model at its samples, NaN where the model cell is empty
     :param empty_V: voltage of an empty cell, V; 2.7 V if that is lower
     """
-    drawn_C = drawn(record.time_s, record.current_A, record.time_s)
+    drawn_C = integrate_load(record.time_s, record.current_A, record.time_s)
     load_A = record.current_A[np.flatnonzero(is_load(record.current_A))[-1]]
     # voltages are compared under the load of the end
     is_end = np.isfinite(model_V) & (np.abs(record.current_A - load_A) < SWITCH_SHARE * abs(load_A))
