@@ -13,7 +13,7 @@ import numpy as np
 from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
 from battery_env.records import SWITCH_SHARE
-from battery_env.records.load import followed_current_A, moment_sd_s, switched_charge
+from battery_env.records.load import lagged_current_A, switch_time_sd_s, switched_charge
 
 # Real ohmic drops follow a current at once in part, where that of the model lags: this share of what lags is in doubt.
 _LATE_SHARE = 0.1
@@ -89,10 +89,10 @@ class ErrorModel:
         # rows may meet a load that is switched again and again at the same place each time: then these errors go together
         switched = switched_charge(time_s, current_A)
         together = switched.sd_C / switched.independent_sd_C if switched.independent_sd_C else 1.0
-        moment_share = np.minimum(together * moment_sd_s(interval_s) / self.to, 1.0)
+        moment_share = np.minimum(together * switch_time_sd_s(interval_s) / self.to, 1.0)
         moment_sd_A = np.where(changed_A > SWITCH_SHARE * most_A, changed_A * moment_share, 0.0)
         # the first sample is at rest, whatever current follows it
-        late_A = _LATE_SHARE * (current_A - followed_current_A(time_s, current_A, self.to))[1:]
+        late_A = _LATE_SHARE * (current_A - lagged_current_A(time_s, current_A, self.to))[1:]
         late_V = self.r_o * np.hypot(late_A, _fading(moment_sd_A, np.exp(-interval_s / self.to)))
         return VoltageError(np.append(0.0, way), self.drift_V, np.hypot(noise_V, np.append(0.0, late_V)))
 

@@ -13,9 +13,9 @@ import numpy as np
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K, check_positive
 from battery_env.electrochemistry import CellParameters, check_cell, check_dt
-from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
+from battery_env.electrochemistry.cell import Q_MOBILE_PER_CAPACITY, new_cell_of
 from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
-from battery_env.electrochemistry.model_error import MORE_ERRORS, independent_errors
+from battery_env.electrochemistry.model_error import ERRORS_PER_DISCHARGE, independent_errors
 from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import (
@@ -57,7 +57,7 @@ _MOST_SAMPLES = 2000
 _ROUNDS = 3
 _FIRST_MISMATCH_V = 0.02
 #: Each discharge shows so many independent errors of the model, unless its residuals change their sign more often.
-INDEPENDENT_ERRORS = independent_errors(1.0, MORE_ERRORS["fit"])
+INDEPENDENT_ERRORS = independent_errors(1.0, ERRORS_PER_DISCHARGE["fit"])
 # The search: how many standard deviations of its prior a constant may move, the logarithm of the distance of q_mobile to its
 # least value, C, and the scale of r_o, ohm.
 _REACH_SD, _LOG_DISTANCE_LIMITS, _R_O_SCALE_OHM = 6.0, (-30.0, 16.0), 0.1
@@ -176,7 +176,7 @@ def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> N
 def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
     """Return what is thought of the constants before the data, but for what is measured."""
     check_cell(start, thermal)
-    q_mobile = float(Q_MOBILE.check(UNDELIVERED * max(drawn_charge_C(record) for record in records)))
+    q_mobile = float(Q_MOBILE.check(Q_MOBILE_PER_CAPACITY * max(drawn_charge_C(record) for record in records)))
     start = new_cell_of(q_mobile) if start is None else start
     known = [getattr(record, "temperature_C", None) for record in records]
     temperatures_C = [column[0] for column in known if column is not None]

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
-from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES, AgingPath
-from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_errors, memory_share
+from battery_env.electrochemistry.aging_path import PATH_DISTANCE_LIMIT_SD, PATH_NAMES, AgingPath
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO, correlation_share, independent_errors
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimates.findings import Reason
@@ -325,7 +325,7 @@ class LeastSquares(Estimator):
             noise_V = max(white_noise_V(at_start_V), _LEAST_NOISE_V)
         if self.path is None:
             priors: list[AnyPrior] = [Prior(name, 0.0, 1.0 / sd) for name, sd in self.nuisance.items()]
-            cell, drift_V = self.model.cell, WHOLE_ERROR * self.mismatch_V
+            cell, drift_V = self.model.cell, UNFITTED_ERROR_RATIO * self.mismatch_V
             if drift_V and noise_V and self._at_rest:  # it is no smaller than the voltage at rest shows, beyond noise
                 start_V2 = float(at_start_V[0]) ** 2 - (MOST_NOISE_SD * noise_V) ** 2 - self.mismatch_V**2
                 drift_V = hypot(drift_V, sqrt(max(start_V2, 0.0)))
@@ -334,7 +334,7 @@ class LeastSquares(Estimator):
                 noise_V or 1.0,
                 cell.r_o,
                 cell.to,
-                memory_share("forecast") * starts[0]["q_mobile"],
+                correlation_share("forecast") * starts[0]["q_mobile"],
                 history.load_on_C,
                 tuple((each.begin_s, each.end_s) for each in dropouts_of(record, cell)),
             )
@@ -370,20 +370,20 @@ class LeastSquares(Estimator):
             fit = search.best([alone.values, *search.starts([mean_C])[0]], [*priors, carried])
             fit = replace(fit, spread=search.spread(fit, [*priors, carried], variance))
         evidence = self._evidence(record, history, fit)
-        return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, evidence.unseen_C), evidence)
+        return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, evidence.sd_charge_C), evidence)
 
     def _evidence(self, record: Samples, history: ChargeHistory, fit: Fit) -> Evidence:
         """What the samples of a record show, with a fit."""
         estimate, soc = [fit.values[name] for name in PARAMETER_NAMES], self.initial_soc[0] if self._at_rest else None
         return evidence_of(record, self.model.cell, soc, estimate, history, _model_V(record, fit))
 
-    def _hidden_sd(self, search: Search, fit: Fit, unseen_C: float) -> dict[str, float]:
+    def _hidden_sd(self, search: Search, fit: Fit, sd_charge_C: float) -> dict[str, float]:
         """
         The standard deviations of what does not show in the voltage: the gain of the current sensor, which scales both
         parameters, and the charge at the start, which the fit makes up for. A charge that nobody saw is like one of these.
         """
         (soc, sd_soc), values, model = self.initial_soc, fit.values, self.model
-        sd_soc = hypot(sd_soc, unseen_C / values["q_mobile"])
+        sd_soc = hypot(sd_soc, sd_charge_C / values["q_mobile"])
         by_soc = np.zeros(len(search.unknown))
         if sd_soc:
             step = _SOC_STEP if soc < 0.5 else -_SOC_STEP
@@ -450,7 +450,7 @@ class LeastSquares(Estimator):
         q_mobile = fit.values["q_mobile"]
         diagnosis.note(Reason.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, self.model.cell.q_mobile))
         if self.path is not None:
-            ratio = self.path.distance_sd(fit.values) / BESIDE_LIMIT_SD
+            ratio = self.path.distance_sd(fit.values) / PATH_DISTANCE_LIMIT_SD
             diagnosis.note(Reason.OTHER_KIND, ratio > 1.0, what="distance from the path of aging cells", ratio=ratio)
         moved = fit.square - alone.square
         diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance)

@@ -35,7 +35,15 @@ from battery_env.lab.sources import find_sources, read_source
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.parameters import Q_MOBILE, R_O
 from battery_env.policies.policy_estimator import PolicyEstimator
-from battery_env.records import STEADY_S, ExpectedCurrent, Samples, drawn, expected_current, history_of, mean_current_A
+from battery_env.records import (
+    STEADY_S,
+    ExpectedCurrent,
+    Samples,
+    expected_current,
+    history_of,
+    integrate_load,
+    mean_current_A,
+)
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
@@ -186,7 +194,7 @@ def calibrated(
         measured_eod_time_s=part.eod_time_s,
         remaining_s=eod_s - float(part.record.time_s[-1]) if part.in_progress else 0.0,
         future_current_A=part.load.mean_A,
-        load_varied=part.load.varied,
+        load_varied=part.load.is_varying,
         settings=settings,
         record=part.record,
         forecast=shown,
@@ -354,7 +362,7 @@ def _charge(
     predicted_Ah, sd_Ah = (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah, settings.current_gain_sd * drawn_Ah
     if part.in_progress:
         predicted_Ah, sd_Ah = (float("nan"),) * 2 if end is None else _middle(end.capacity_Ah, estimate)
-    unseen_Ah = hypot(part.loaded.unseen_C, dropped_C) / 3600.0
+    unseen_Ah = hypot(part.loaded.sd_charge_C, dropped_C) / 3600.0
     return {
         "capacity_Ah": float("nan") if part.in_progress or start.soc < 1.0 else drawn_Ah,
         "predicted_capacity_Ah": predicted_Ah,
@@ -385,7 +393,7 @@ def _charge_after(discharge: Discharge, loaded: Discharge, eod_time_s: float, cu
                 stacklevel=5,
             )
         return 0.0
-    until_C, in_all_C = drawn(discharge.time_s, discharge.current_A, [eod_time_s, discharge.time_s[-1]]).tolist()
+    until_C, in_all_C = integrate_load(discharge.time_s, discharge.current_A, [eod_time_s, discharge.time_s[-1]]).tolist()
     more_C = in_all_C - until_C
     if more_C <= _MORE_SHARE * until_C:
         return 0.0
@@ -421,7 +429,7 @@ def _is_all_logged(part: _LoadedPart, evidence: Evidence) -> bool:
     """
     # a charge that tapered off fills any cell, whatever its voltage at rest
     charge = part.record.history.charge
-    is_lower = evidence.first_V < evidence.start_V and not (charge and charge.tapered)
+    is_lower = evidence.first_V < evidence.start_V and not (charge and charge.is_tapered)
     return not (evidence.fault or (is_lower and evidence.start) or evidence.charges_C[Doubt.GAP])
 
 

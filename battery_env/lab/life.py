@@ -20,7 +20,7 @@ from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
@@ -28,7 +28,7 @@ from battery_env.estimators.least_squares import Alternative, LeastSquares
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
-from battery_env.records import VARIED_SHARE, DischargeStart, drawn, drawn_charge_C, mean_current_A
+from battery_env.records import VARIED_SHARE, DischargeStart, drawn_charge_C, integrate_load, mean_current_A
 from battery_env.records.discharge import Discharge
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
@@ -92,7 +92,7 @@ class Life:
         """The prior of so many discharges later, at the load of the life or at another one, A; NaN: at any."""
         mean_C, sd_C = self.later_q_mobile_C(count)
         if other_A is not None:
-            return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * hypot(self.sd_share, self._open_share(other_A)))
+            return mean_C, hypot(sd_C, mean_C * UNFITTED_ERROR_RATIO * hypot(self.sd_share, self._open_share(other_A)))
         whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
         lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
         return lasted * mean_C, lasted * sd_C
@@ -297,7 +297,7 @@ def _row_of(discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: 
     estimate = held.estimate(record)
     of_its_own = estimate if held.nuisance == unsure.nuisance else unsure.estimate(record)
     end_s = held.model.forecast(record, estimate, cut_off_V).eod_time_s
-    capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
+    capacity_Ah = float(integrate_load(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
     # what leaves the resistance in doubt is no doubt of q_mobile
     of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]

@@ -13,8 +13,8 @@ import numpy as np
 from battery_env.checks import check_positive, hinting
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
-from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.cell import Q_MOBILE_PER_CAPACITY, new_cell_of
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.estimates.findings import Finding, Reason
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
@@ -192,7 +192,7 @@ class Settings:
         """Of a new cell of the nominal capacity, or of a new 18650 where none is stated."""
         if self.nominal_Ah is None:
             return NEW_CELL.q_mobile
-        return float(np.clip(UNDELIVERED * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
+        return float(np.clip(Q_MOBILE_PER_CAPACITY * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
 
     @property
     def usual_q_mobile_C(self) -> float | None:
@@ -249,7 +249,7 @@ class Settings:
         rates_sd = self._rates_sd()
         # constants that are anybody's, once they are free, explain as much of the error as q_mobile and r_o absorb
         is_explained = rates_sd is RATE_PRIOR_SD
-        mismatch_V = resolved.mismatch_V / WHOLE_ERROR if is_explained else resolved.mismatch_V
+        mismatch_V = resolved.mismatch_V / UNFITTED_ERROR_RATIO if is_explained else resolved.mismatch_V
         return LeastSquares(
             mismatch_V=mismatch_V, nuisance=rates_sd, path=self.path, usual_q_mobile_C=usual_q_mobile_C, **common
         )

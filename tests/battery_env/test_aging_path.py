@@ -316,9 +316,9 @@ class TestTask:
         task = VoltageTask(4, dataset=data, path=path, cost="state", new_readings=(0, 0))
         task.start(np.arange(4), [np.random.default_rng(k) for k in range(4)])
         assert task.observation().shape == (4, 120)
-        fitted, (low, high) = task.fitted(), np.transpose(list(ESTIMATE_RANGES.values()))
+        fit, (low, high) = task.fit(), np.transpose(list(ESTIMATE_RANGES.values()))
         task.advance(np.tile([0.25, -0.5], (4, 1)))
-        np.testing.assert_allclose(task.estimate, np.clip(fitted.estimate + [0.5, -1.0] * fitted.sd, low, high))
+        np.testing.assert_allclose(task.estimate, np.clip(fit.estimate + [0.5, -1.0] * fit.sd, low, high))
 
     @pytest.mark.attacks
     def test_intervals_along_the_path_hold(self, path):

@@ -11,7 +11,7 @@ from numpy.polynomial import Legendre
 from battery_env import CellParameters, Estimate, LeastSquares, fit_cell, forecast
 from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, voltage
 from battery_env.electrochemistry.equilibrium import with_equilibrium
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, CellFit, read_cell
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, JointFit
@@ -182,7 +182,7 @@ class TestRealCells:
         for discharge in load_nasa_discharges("B0006")[8::40]:
             record = discharge.loaded_part(2.7)
             error_V = own.model.voltage(record, own.estimate(record)) - record.voltage_V
-            assert np.sqrt(np.mean(error_V**2)) < WHOLE_ERROR * b0005_fit.mismatch_V
+            assert np.sqrt(np.mean(error_V**2)) < UNFITTED_ERROR_RATIO * b0005_fit.mismatch_V
         assert all(f"{1e3 * error_V:.1f} mV\n" in b0005_fit.summary() + "\n" for error_V in shown_V)
 
     @pytest.mark.parametrize("numbers", sweep([0, 10, 20], [0], [5, 5, 5]), ids=["young", "one", "copies"])

@@ -387,7 +387,7 @@ class TestForecasts:
         half, errors = len(record.time_s) // 2, []
         for stop in range(half, half + period, period // 4):
             seen = changed(record, slice(stop))
-            assert expected_current(seen.time_s, seen.current_A).varied
+            assert expected_current(seen.time_s, seen.current_A).is_varying
             errors.append(self.model.forecast(seen, self.truth, 2.8).eod_time_s / record.time_s[-1] - 1.0)
         assert 0.0 < np.mean(errors) < 0.1  # under pulses the cut-off is reached earlier than under their mean
         assert np.max(errors) < 0.15

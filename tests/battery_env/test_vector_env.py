@@ -92,7 +92,7 @@ def test_every_task_reports_what_info_promises(discharges):
     batch = gym.make_vec("BatteryQmax-v0", num_envs=2, dataset=discharges)
     assert batch.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP  # as of Gymnasium
     _, info = batch.reset(seed=0)
-    names = {"cost", *CalibrationTask.REPORTED}
+    names = {"cost", *CalibrationTask.REPORT_NAMES}
     assert set(info) == names | {f"_{name}" for name in names}
     # arrays of their own: the next step does not change them
     before = {name: values.copy() for name, values in info.items()}

@@ -119,8 +119,8 @@ class TestTask:
         (generator,) = generators(1, seed=7)
         generator.integers(0, 30, size=8)  # how many readings arrive
         shown = RandomSensorErrors(**sensors).draw(generator).apply(data[3], generator)
-        evaluated = VoltageTask.follow([shown], 1500.0, start="true", **sensors)
-        exact = VoltageTask.follow([data[3]], 1500.0, start="true", **sensors)
+        evaluated = VoltageTask.of_records([shown], 1500.0, start="true", **sensors)
+        exact = VoltageTask.of_records([data[3]], 1500.0, start="true", **sensors)
         np.testing.assert_allclose(task.observation(), evaluated.observation(), atol=0.05)
         assert np.abs(exact.observation() - evaluated.observation()).max() > 0.2
 
@@ -143,7 +143,7 @@ class TestTask:
         with pytest.raises(ValueError, match="and 2 of 10 discharges are not simulated: take cost='misfit'"):
             VoltageTask(1, dataset=[*data, *recorded], cost="state")
         # a policy that was trained with it can be asked about one
-        task = VoltageTask.follow(recorded, 30, cost="state")
+        task = VoltageTask.of_records(recorded, 30, cost="state")
         assert np.isfinite(task.advance(np.zeros((2, 2)))).all()
 
     @pytest.mark.parametrize(
