@@ -14,7 +14,7 @@ import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import fields
 from difflib import get_close_matches
 from importlib.util import find_spec
@@ -359,7 +359,9 @@ def _calibrate_all(
         absent = f", {results.absent} of them of files that are not there now" if results.absent else ""
         print(f"going on: {done} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True)
     try:
-        with workers(options.jobs, options.scheduler) as executor, saying_that_it_compiles():
+        is_serial = options.jobs == 1 and options.scheduler is None
+        side_by_side = nullcontext() if is_serial else workers(options.jobs, options.scheduler)
+        with side_by_side as executor, saying_that_it_compiles():
             ahead = 64 if options.scheduler or options.jobs < 1 else 2 * options.jobs
             for outcome in calibrate_all(sources, file_format, settings, results, executor, ahead):
                 _report(outcome, options.json)
