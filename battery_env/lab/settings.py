@@ -200,12 +200,12 @@ class Settings:
         is_known = self.prior_q_mobile_C is not None or self.cell is not None
         return None if is_known else _USUAL_SHARE * self._new_q_mobile_C
 
-    def with_nominal_cell(self) -> Settings:
-        """With the constants of a cell of the nominal capacity, where that is of another size and nothing else is known."""
-        cell = new_cell_of(self._new_q_mobile_C)
-        if self.usual_q_mobile_C is None or self.method == "policy" or cell is NEW_CELL:
-            return self
-        return replace(self, cell=cell, cell_rates_sd=RATE_PRIOR_SD)
+    @property
+    def constants_in_progress(self) -> CellParameters:
+        """Of the model while a discharge is in progress: of a cell of the nominal capacity, where nothing else is known."""
+        if self.usual_q_mobile_C is None or self.method == "policy":
+            return self.constants
+        return new_cell_of(self._new_q_mobile_C)
 
     def other_load(self, current_A: float) -> tuple[Finding, ...]:
         """Why the constants may not hold for a mean current; empty if they do."""
