@@ -45,7 +45,6 @@ class Confidence:
     """
 
     def __init__(self, task: VoltageTask, cell: CellParameters, dt_s: float) -> None:
-        self._parameters = task.parameters
         self._offset_V = task.sensors.offset_V
         self._path: AgingPath | None = task.path
         self._sd_ratio = 1.0 if task.path is None else task.path.sd_ratio
@@ -79,7 +78,7 @@ class Confidence:
         # the first voltage may be that of a full cell with the largest offset, and noise and model beyond
         beyond_V = self._offset_V + MOST_NOISE_SD * hypot(white_V, MISMATCH_MARGIN * mismatch_V)
         diagnosis.note(Reason.START_DIFFERS, float(record.voltage_V[0]) > rest_voltage_V(cell) + beyond_V)
-        diagnosis.note(Reason.FEW, readings < len(self._parameters) + SPARE_SAMPLES)
+        diagnosis.note(Reason.FEW, readings < len(PARAMETER_NAMES) + SPARE_SAMPLES)
         limit_V2 = misfit_limit_V2(white_V, readings, mismatch_V, negligible_V=_LINEAR_STEP_V)
         diagnosis.note(Reason.MISFIT, not square(residual_V) <= readings * limit_V2)
         most_sd = REACH_SD if path is None else BESIDE_LIMIT_SD
@@ -90,14 +89,12 @@ class Confidence:
             if size > (1.0 - _ROUNDING) * most:  # as a fit keeps within its reach
                 diagnosis.note(Reason.OTHER_KIND, what=what, ratio=size / most)
         for k, name in enumerate(PARAMETER_NAMES):
-            if name in self._parameters:
-                diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
+            diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
         values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
         known = Assumptions(apart=dict(zip(PARAMETER_NAMES, apart.tolist(), strict=True)), is_along_path=path is not None)
-        verdict = diagnosis.verdict(values, sds, self._parameters, known=known)
-        stated = dict(zip(PARAMETER_NAMES, np.hypot(self._sd_ratio * fitted.sd[n], hidden).tolist(), strict=True))
+        verdict = diagnosis.verdict(values, sds, PARAMETER_NAMES, known=known)
         # the same NaN always, so that equal estimates are equal
-        sd_q_mobile, sd_r_o = (nan if name not in self._parameters or isnan(sd) else sd for name, sd in stated.items())
+        sd_q_mobile, sd_r_o = (nan if isnan(sd) else sd for sd in np.hypot(self._sd_ratio * fitted.sd[n], hidden).tolist())
         constants = None if path is None else _by_name(fitted, n)
         return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **verdict._asdict(), constants=constants)
 
