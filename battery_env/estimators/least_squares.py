@@ -33,8 +33,8 @@ from battery_env.estimators.search import (
     Prior,
     Search,
     SizePrior,
-    root_inverse_diagonal,
     square,
+    standard_deviations,
 )
 from battery_env.estimators.verdict import (
     PRIOR_LIMIT_SD,
@@ -92,7 +92,7 @@ class RecordFit:
     def sd(self, fit: Fit, ratios: Mapping[str, float]) -> dict[str, float]:
         """The standard deviations of a fit, so many times as large as it says, with those of what does not show."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
-        for name, root in zip(self.search.parameters, root_inverse_diagonal(fit.jacobian), strict=False):
+        for name, root in zip(self.search.parameters, standard_deviations(fit.jacobian), strict=False):
             ratio = ratios.get(name, 1.0) * (fit.spread if name == "q_mobile" else 1.0)
             knee_sd_C = fit.knee_sd_C if name == "q_mobile" else 0.0
             sd[name] = hypot(ratio * sqrt(self.variance) * float(root), self.hidden_sd[name], knee_sd_C)
