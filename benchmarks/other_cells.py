@@ -82,21 +82,25 @@ def _ends(discharge: Discharge, before: Sequence[Discharge], fit: CellFit, cut_o
     current_A = mean_current_A(discharge.loaded_part(cut_off_V))
     parts = [each.loaded_part(cut_off_V) for each in before]
     alike = [each for each in parts if abs(mean_current_A(each) / current_A - 1.0) <= VARIED_SHARE]
-    rows = []
-    for share in SHARES:
-        seen = discharge.until(start_s + share * (end_s - start_s))
-        record, load = seen.loaded_part(cut_off_V), constant(current_A, "current")
+    rows: list[dict[str, Any]] = []
+    seen = [discharge.until(start_s + share * (end_s - start_s)) for share in SHARES]
+    for share, part_seen in zip(SHARES, seen, strict=True):
+        record, load = part_seen.loaded_part(cut_off_V), constant(current_A, "current")
         counted_s = coulomb_count(parts[-1], record, load)
         as_long_s = as_long_as_the_last(alike[-1], record, load) if alike else np.nan
-        row = {"share": share, "current_A": current_A, "refused": ""}
+        rows.append({"share": share, "current_A": current_A, "refused": ""})
         for method, said_s in (("count", counted_s), ("as_long", as_long_s)):
-            row[f"{method}_error_percent"] = 100.0 * (said_s - end_s) / (end_s - start_s)
+            rows[-1][f"{method}_error_percent"] = 100.0 * (said_s - end_s) / (end_s - start_s)
+    try:
+        life = track_life(before, cut_off_V, fit.calibrator())
+    except ValueError as error:
+        return [row | {"refused": str(error)} for row in rows]
+    for row, part_seen in zip(rows, seen, strict=True):
         try:
-            life = track_life(before, cut_off_V, fit.calibrator())
-            quantiles_s = forecast_end(seen, Settings(cell=fit), life=life).eod_quantile_s()
-            rows.append(row | end_in_percent(quantiles_s, start_s, end_s))
+            quantiles_s = forecast_end(part_seen, Settings(cell=fit), life=life).eod_quantile_s()
+            row |= end_in_percent(quantiles_s, start_s, end_s)
         except ValueError as error:
-            rows.append(row | {"refused": str(error)})
+            row["refused"] = str(error)
     return rows
 
 

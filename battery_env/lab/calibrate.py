@@ -237,6 +237,10 @@ def _estimate(part: _LoadedPart, settings: Settings, usual_q_mobile_C: float | N
     if doubts := part.start.findings or settings.other_load(mean_current_A(part.record)):
         # of the charge: the resistance, which is settled within 30 %, is not in question
         estimate = replace(estimate, settled_q_mobile=False, findings=(*estimate.findings, *doubts))
+    if other_size := settings.other_size(estimate, float(part.loaded.charge_C)):
+        # the scale of the current is in question, and all numbers with it
+        estimate = replace(estimate, settled=False, settled_q_mobile=False, settled_r_o=False, settled_resistance_10s=False)
+        estimate = replace(estimate, findings=(*other_size, *estimate.findings))
     model = RecordModel(cell, thermal, initial_soc=part.start.soc)
     return estimate, settings.method or "least-squares", model
 
