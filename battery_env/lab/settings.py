@@ -79,8 +79,8 @@ class Settings:
     :param thermal: whether the temperature of the model changes; ``None``: as in the fit of ``cell``, or true
     :param nominal_Ah: nominal capacity for the state of health, Ah; ``None``: the charge that ``cell`` with its own
         ``q_mobile`` and ``r_o`` gives from full at the current of the discharge, or unknown without a ``cell``. Without other
-        prior knowledge the nominal capacity is also the expected size of a cell in progress, instead of a new 18650. No estimate
-        of another size than such cells have, new or worn, is settled
+        prior knowledge the nominal capacity is also the expected size of a cell in progress, instead of a new 18650. No
+        estimate of another size than such cells have, new or worn, is settled
     :param cell: constants of the model, or a result of ``fit_cell``: more than a quarter beyond the loads of the fit no
         estimate is settled, and the nominal capacity is unknown. Or a result of ``fit_life``, the path of aging cells of this
         kind, for least squares. ``None``: the constants of a new 18650
