@@ -459,7 +459,11 @@ class LeastSquares(Estimator):
             ratio = self.path.distance_sd(fit.values) / PATH_DISTANCE_LIMIT_SD
             diagnosis.note(Reason.OTHER_KIND, ratio > 1.0, what="distance from the path of aging cells", ratio=ratio)
         moved = fit.square - alone.square
-        diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance)
+        is_far = moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance
+        mean_C, sd_C = self.prior_q_mobile_C or (nan, nan)
+        expected_C = {"least_Ah": mean_C - PRIOR_LIMIT_SD * sd_C, "most_Ah": mean_C + PRIOR_LIMIT_SD * sd_C}
+        sizes_Ah = {name: size_C / 3600.0 for name, size_C in {"record_Ah": alone.values["q_mobile"], **expected_C}.items()}
+        diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, is_far, **sizes_Ah)
         differing = self._differing(fitted)
         diagnosis.note(Reason.RESISTANCE_DIFFERS, bool(differing), **differing)
         for name in fit.at_bound:

@@ -30,8 +30,8 @@ _LOG_LIMIT = 50.0
 _REACHED = dict.fromkeys(RATE_CONSTANTS, (-5.0, 5.0))
 # A resistance that the search takes below zero has no logarithm.
 _LEAST = 1e-6
-# About so far apart, in the logarithm of q_mobile, are cells of one size.
-_SIZE_WIDTH = 0.2
+#: About so far apart, in the logarithm of q_mobile, are cells of one size.
+SIZE_WIDTH = 0.2
 _SCALES = {"q_mobile": 1.0, "r_o": 0.1}
 # Where the search for q_mobile may start: this much above its least value. The narrow ones serve whole discharges, the wide
 # ones the first minutes of one.
@@ -111,10 +111,10 @@ class SizePrior:
 
     def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """The residual, and its derivatives by all unknowns."""
-        distance = log(values["q_mobile"] / self.usual_C) / _SIZE_WIDTH
+        distance = log(values["q_mobile"] / self.usual_C) / SIZE_WIDTH
         residual = copysign(sqrt(log1p(distance**2)), distance)
         slope = distance / (1.0 + distance**2) / residual if residual else 1.0
-        row = np.array([[slope / (_SIZE_WIDTH * values["q_mobile"]) if name == "q_mobile" else 0.0 for name in unknown]])
+        row = np.array([[slope / (SIZE_WIDTH * values["q_mobile"]) if name == "q_mobile" else 0.0 for name in unknown]])
         return np.array([residual]), row
 
 

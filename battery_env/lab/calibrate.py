@@ -277,6 +277,10 @@ def estimate(loaded: LoadedPart) -> Fit:
     if doubts := start.findings or settings.other_load(mean_current_A(record)):
         # of the charge: the resistance, which is settled within 30 %, is not in question
         result = replace(result, settled_q_mobile=False, findings=(*result.findings, *doubts))
+    if other_size := settings.other_size(result, float(loaded.part.charge_C)):
+        # the scale of the current is in question, and all numbers with it
+        result = replace(result, settled=False, settled_q_mobile=False, settled_r_o=False, settled_resistance_10s=False)
+        result = replace(result, findings=(*other_size, *result.findings))
     # a cell in progress has not ended, however low its model comes in the pulses before
     cut_off_V, current_A = (-np.inf, 0.0) if loaded.in_progress else (resolved.cut_off_V, loaded.load.mean_A)
     voltage = model.forecast(record, result, cut_off_V, current_A)
