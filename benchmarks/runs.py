@@ -36,7 +36,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from battery_env.files import replacing
-from benchmarks.study import Study, command_line, digest_of, importable, natural, positive, versions
+from benchmarks.study import Study, command_line, digest_of, importable, natural, positive, table_file, versions, write_csv
 
 #: A policy is judged so often while it is trained, at even distances, of which the last is the end.
 POINTS = 10
@@ -139,15 +139,16 @@ class Rows:
     """
     The trainings that are done, in a table that several commands may add to.
 
-    :param file: the table, CSV
+    :param folder: where the table lies, ``runs.csv`` or, of many rows, ``runs.csv.gz``
     """
 
-    def __init__(self, file: Path) -> None:
-        self.file = file
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
     def read(self, types: Any = None) -> pd.DataFrame:
         """All rows; none if there is no file yet."""
-        return pd.read_csv(self.file, dtype=types) if self.file.exists() else pd.DataFrame(columns=_KEY)
+        file = table_file(self.folder, "runs")
+        return pd.read_csv(file, dtype=types) if file.exists() else pd.DataFrame(columns=_KEY)
 
     def of(self, runs: Sequence[Run]) -> pd.DataFrame:
         """The rows of trainings in their order, of the last release that made one."""
@@ -163,16 +164,11 @@ class Rows:
 
     def add(self, rows: pd.DataFrame) -> None:
         """Add rows. Of two of the same training the first stays."""
-        self.file.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(self.file.with_name(f".{self.file.name}.lock")):
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(self.folder / ".runs.lock"):
             # as texts: no number changes for being read and written
             together = pd.concat([self.read(str), rows.astype({name: str for name in _KEY})])
-            with replacing(self.file) as part:
-                together.drop_duplicates(_KEY).to_csv(part, index=False)
-
-    def merge(self, file: Path) -> None:
-        """Add the rows of another table, as of another machine."""
-        self.add(Rows(file).read(str))
+            write_csv(self.folder, "runs", together.drop_duplicates(_KEY).to_csv(index=False))
 
 
 def save_checkpoint(model: BaseAlgorithm, file: Path, progress: Mapping[str, Any]) -> None:
@@ -261,7 +257,7 @@ class Trainer:
     """
     Makes rows, in any process.
 
-    :param file: the table
+    :param folder: where the table of rows lies
     :param checkpoints: folder of the trainings in progress
     :param judge: gives the model of a training a number, while it is trained
     :param describe: gives it more of them in the end, by name
@@ -269,7 +265,7 @@ class Trainer:
     :param compiled: whether updates are compiled where they can be, which changes no result but the time
     """
 
-    file: Path
+    folder: Path
     checkpoints: Path
     judge: Callable[[OffPolicyAlgorithm, Run], float]
     describe: Callable[[OffPolicyAlgorithm, Run], Mapping[str, float]] | None = None
@@ -281,7 +277,7 @@ class Trainer:
         self.checkpoints.mkdir(parents=True, exist_ok=True)
         try:
             with FileLock(self.checkpoints / f".{run.name}.lock", timeout=0):
-                if time.time() < self.deadline and not Rows(self.file).has(run):
+                if time.time() < self.deadline and not Rows(self.folder).has(run):
                     self._train(run)
         except (Timeout, OutOfTimeError):
             return
@@ -302,7 +298,7 @@ class Trainer:
         made["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
         described = self.describe(model, run) if self.describe else {}
         row = {**run.key, **progress.curve, **described, **made}
-        Rows(self.file).add(pd.DataFrame([row]))
+        Rows(self.folder).add(pd.DataFrame([row]))
         file.unlink(missing_ok=True)
 
 
@@ -334,13 +330,13 @@ def make_rows(
     chosen = study.chosen
     for name in ("minutes", "checkpoints", "merge"):
         del study.configuration[name]  # which change no row
-    rows = Rows(study.out / "runs.csv")
+    rows = Rows(study.out)
     for file in chosen.merge:
-        rows.merge(file)
+        rows.add(pd.read_csv(file, dtype=str))
     if not study.redraws:
         deadline = time.time() + 60 * chosen.minutes if chosen.minutes else np.inf
         describe = importable(describe) if describe else None
-        trainer = Trainer(rows.file, chosen.checkpoints, importable(judge), describe, deadline, chosen.compile)
+        trainer = Trainer(study.out, chosen.checkpoints, importable(judge), describe, deadline, chosen.compile)
         study.each(trainer, [(run,) for run in runs if not rows.has(run)])
     done = rows.of(runs)
     whole = done[done.groupby(["task", "algorithm"])["seed"].transform("nunique") == len(set(chosen.seeds))]

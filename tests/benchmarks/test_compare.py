@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from battery_env import ClosedForm, evaluate
 from benchmarks import compare, contests
-from benchmarks.study import write_json
+from benchmarks.study import table_file, write_json
 from benchmarks.training import Recipe, finished_model, made_by, record_file
 from tests.sweeps import sweep
 
@@ -236,7 +236,7 @@ def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_pa
     assert (least_squares < table.loc[table["calibrator"] == "LAC", "r_o_second_half_percent"].min()).all()
     assert least_squares.iloc[1] > least_squares.iloc[0]
     assert re.search(r"\| BatteryVoltageJoint-v0 +\| 5 mV noise +\| LAC ", capsys.readouterr().out)
-    published = ROOT / "docs" / "results" / "voltage" / "BatteryVoltageJoint-v0_scores.csv"
+    published = table_file(ROOT / "docs" / "results" / "voltage", "BatteryVoltageJoint-v0_scores")
     assert set(pd.read_csv(out / "BatteryVoltageJoint-v0_scores.csv")) <= set(pd.read_csv(published, nrows=1))
     assert len(pd.read_csv(out / "BatteryVoltageJoint-v0_r_o_learning.csv")) == 2
     assert json.loads((out / "BatteryVoltageJoint-v0.json").read_text())["configuration"]["recipes"]

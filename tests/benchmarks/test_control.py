@@ -15,6 +15,7 @@ pytest.importorskip("rl_zoo3")
 
 from benchmarks import control, stabilisation
 from benchmarks.runs import setting_of_lac
+from benchmarks.study import table_file
 from docs.environment_pages import DOCS, environment_page
 from sb3_lac import LAC
 from sb3_lac.stability import fitting
@@ -90,7 +91,8 @@ def test_only_some_loops_end_at_the_goal(env_id):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_pages_say_what_the_published_table_says(env_id):
-    table = pd.read_csv(DOCS / "results/stabilisation/stabilisation.csv").set_index(["environment", "policy", "disturbance"])
+    table = pd.read_csv(table_file(DOCS / "results/stabilisation", "stabilisation"))
+    table = table.set_index(["environment", "policy", "disturbance"])
     row = table.loc[env_id, "reference", "none"]
     section = re.search(r"## Reference Controller\n(.*?)\n## ", environment_page(env_id), flags=re.DOTALL)[1]
     text = " ".join(section.split())
