@@ -72,7 +72,7 @@ def test_a_training_that_was_killed_goes_on_from_its_checkpoint(trainer, monkeyp
 
     with pytest.raises(Killed):
         replace(trainer, judge=judge)(run)
-    assert rows_of(trainer).empty and [path.name for path in trainer.checkpoints.glob("*.zip")] == [f"{run.name}.zip"]
+    assert rows_of(trainer).empty and [path.name for path in trainer.checkpoints.glob("*.zip")] == [f"checkpoint_{run.name}.zip"]
     replace(trainer, judge=judge)(run)
     (row,) = rows_of(trainer).to_dict("records")
     assert row["resumed"] == 1 and not list(trainer.checkpoints.glob("*.zip"))
@@ -112,7 +112,7 @@ def test_what_is_compiled_and_how_large_the_buffer_is_is_no_part_of_a_run(monkey
 
 
 def test_the_setting_of_lac_is_that_of_its_file():
-    run = replace(RUN, settings=runs.setting_of_lac())
+    run = replace(RUN, settings=runs.setting_of_lac(root=4))
     env = run.environments()
     model = run.model(env, compiled=False)
     assert env.num_envs == 4 and (model.gradient_steps, model.learning_starts, model.tau) == (2, 1000, 0.01)
