@@ -28,6 +28,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import coloured
+from benchmarks import roots
 from benchmarks.control import DISTURBANCES, IMPULSE_INTERVAL, conditions, roll_out
 from benchmarks.runs import Run, make_rows, rows_command_line, setting_of_lac
 from benchmarks.study import Study, add_legend, digits, markdown, natural, new_panels, table_of, with_interval
@@ -45,13 +46,7 @@ PARAMETERS = {
 #: What is outside of the ranges of pushes and noises, in parts of their ends; delays are a step longer.
 BEYOND = 1.5
 TIMESTEPS = 30_000
-ALGORITHMS = {
-    "lac": ("LAC", "sb3_lac:LAC"),
-    "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC"),
-    "lac_fourth_root": ("LAC (root=4)", "sb3_lac:LAC"),
-    "sac": ("SAC", "stable_baselines3:SAC"),
-    "tqc": ("TQC", "sb3_contrib:TQC"),
-}
+ALGORITHMS = {**roots.ALGORITHMS, "tqc": ("TQC", "sb3_contrib:TQC", None)}
 #: Whom they are compared with.
 RIVALS = ("SAC", "TQC")
 EPISODES = 100
@@ -84,11 +79,10 @@ def outside(env_id: str) -> dict[str, dict[str, Any]]:
 
 def run_of(env_id: str, algorithm: str, seed: int, last_actions: int = 0, timesteps: int | None = None) -> Run:
     """A training of this study."""
-    label, kind = ALGORITHMS[algorithm]
+    label, kind, root = ALGORITHMS[algorithm]
     environment = {"drawn": drawn(env_id), "impulse_interval": IMPULSE_INTERVAL}
     if last_actions:
         label, environment["last_actions"] = f"{label}, {last_actions} last actions", last_actions
-    root = {"lac_fourth_root": 4, "lac_square_root": 2}.get(algorithm)
     return Run(env_id, label, kind, seed, timesteps or TIMESTEPS, setting_of_lac(root), environment)
 
 

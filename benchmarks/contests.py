@@ -32,6 +32,7 @@ from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.full_state.full_state_task import FullStateTask
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.kalman_filter import PlainKalmanFilter
+from benchmarks.runs import registered_id
 from benchmarks.study import (
     EVALUATION_SEED,
     SYMBOLS,
@@ -45,7 +46,6 @@ from benchmarks.study import (
     with_interval,
     with_spread,
 )
-from benchmarks.training import registered_id
 
 #: What the voltmeter does to the test discharges of voltage-only tasks.
 SENSORS: dict[str, SensorErrors | RandomSensorErrors] = {
@@ -371,7 +371,7 @@ def recipes_of(runs: pd.DataFrame) -> dict[str, Any]:
     """What made the runs of a table."""
     recipes: dict[str, Any] = {}
     for digest, of_run in zip(runs["recipe"], runs["made_by"], strict=True):
-        recipe = dict(of_run["recipe"])
+        recipe = {**of_run["run"], "defaults": of_run["defaults"]}
         seed = {"seed": recipe.pop("seed"), "resumed": of_run["resumed"], "versions": of_run["versions"]}
         recipes.setdefault(digest, {**recipe, "runs": []})["runs"].append(seed)
     return {"recipes": recipes}

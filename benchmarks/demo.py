@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,8 +26,9 @@ from battery_env import PolicyEstimator, TrajectoryDataset, evaluate
 from battery_env.callbacks import CalibrationCallback
 from battery_env.lab.batch import workers
 from battery_env.plotting import plot_learning_curves, plot_true_against_inferred, save_figure
+from benchmarks.runs import train_or_load
 from benchmarks.study import importable
-from benchmarks.training import Recipe, Training
+from benchmarks.zoo_runs import zoo_run
 
 RESULTS = Path("results")
 ENV, PARAMETER, CELL = "BatteryRo-v0", "r_o", "B0005"
@@ -47,16 +48,16 @@ class Learned(NamedTuple):
 def learned(algo: str) -> Learned:
     """Train one policy by its entry in zoo_configs."""
     _, test = TrajectoryDataset.paper(PARAMETER).split(test=0.3, seed=0)
-    recipe = Recipe.of(algo, ENV, 0, updates=UPDATES, evaluations=EVALUATIONS)
+    run = zoo_run(algo, ENV, 0, updates=UPDATES)
     callback = CalibrationCallback(
         lambda model: evaluate(PolicyEstimator(model, ENV), test[::EVERY]),
-        recipe.evaluation_freq,
+        run.timesteps // (EVALUATIONS * run.n_envs),
         {f"{PARAMETER}_mape_percent": "mape_percent"},
         verbose=0,
     )
-    with tempfile.TemporaryDirectory() as folder, closing(Training(recipe, Path(folder))) as training:
-        training.run([callback])
-        scores = evaluate(PolicyEstimator(training.model, ENV), test[::EVERY_IN_THE_END])
+    with tempfile.TemporaryDirectory() as folder:
+        model = train_or_load(run, Path(folder), callbacks=[callback])
+    scores = evaluate(PolicyEstimator(model, ENV), test[::EVERY_IN_THE_END])
     return Learned(pd.DataFrame(callback.history), scores)
 
 

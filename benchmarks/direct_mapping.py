@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -35,6 +36,7 @@ from battery_env.parameters import PARAMETER_NAMES
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.tasks.full_state.layout import LITERAL, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
+from benchmarks.runs import train_or_load
 from benchmarks.study import (
     SYMBOLS,
     Cell,
@@ -49,7 +51,7 @@ from benchmarks.study import (
     table_of,
     with_spread,
 )
-from benchmarks.training import Recipe, train_or_load
+from benchmarks.zoo_runs import zoo_run
 
 Parameter = Literal["q_mobile", "r_o"]
 Parts = tuple[TrajectoryDataset, TrajectoryDataset]
@@ -93,9 +95,9 @@ def divided(parameter: Parameter, division: str) -> Parts:
 def train_policy(algo: str, parameter: Parameter, seed: int, updates: int | None, out: Path) -> BaseAlgorithm:
     """Train a policy on the less aged cells, or load it if that has been done."""
     env_id = ENV_IDS[parameter]
-    options = Recipe.of(algo, env_id, seed).hyperparameters.get("env_kwargs", {})
-    chosen = {"env_kwargs": {**options, "dataset": str(training_file(parameter, out))}}
-    return train_or_load(Recipe.of(algo, env_id, seed, updates=updates, hyperparameters=chosen), out / "models")
+    run = zoo_run(algo, env_id, seed, updates=updates)
+    on_less_aged = {**run.environment, "dataset": str(training_file(parameter, out))}
+    return train_or_load(replace(run, environment=on_less_aged), out / "models")
 
 
 def training_file(parameter: Parameter, out: Path) -> Path:

@@ -9,11 +9,11 @@ LAC beside SAC, TD3 and TQC on tasks of Gymnasium, which nobody here made or tun
   python -m benchmarks.outside --merge rows/runs.csv --redraw
 
 Every algorithm has its defaults, but SAC, TD3 and TQC those settings of the RL Zoo that are tuned for a task with at most 50
-thousand steps; ``lac_zoo`` is LAC with those of SAC. ``lac_common`` is LAC with its one setting for control problems. The
-critics of ``lac_square_root`` and ``lac_fourth_root`` learn that root, and the weight of the entropy begins at 1 in
-``lac_higher_start``, as SAC's does. A policy is judged by its mean action, in 20 episodes that no training starts with. A
-training that is done is a row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command goes
-on from there.
+thousand steps. ``lac_zoo`` is LAC on the car (MountainCarContinuous-v0) alone, with a square root and the RL Zoo's settings
+of SAC there. ``lac_common`` is LAC with its one setting for control problems. The critics of ``lac_square_root`` and
+``lac_fourth_root`` learn that root, and the weight of the entropy begins at 1 in ``lac_higher_start``, as SAC's does. A
+policy is judged by its mean action, in 20 episodes that no training starts with. A training that is done is a row of
+``runs.csv``, which nothing but a change of what was run makes anew. The same command goes on from there.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ _SQUARE_ROOT, _FOURTH_ROOT = ({"policy_kwargs": f"dict(root={root})"} for root i
 ALGORITHMS: dict[str, tuple[str, str, dict[str, Any] | None]] = {
     "lac": ("LAC", "sb3_lac:LAC", {}),
     "published_lac": ("LAC as published", "sb3_lac:PublishedLAC", {}),
-    "lac_common": ("LAC (root=4), its one setting", "sb3_lac:LAC", setting_of_lac()),
-    "lac_zoo": ("LAC, the RL Zoo's settings of SAC", "sb3_lac:LAC", None),
+    "lac_common": ("LAC (root=4), its one setting", "sb3_lac:LAC", setting_of_lac(4)),
+    "lac_zoo": ("LAC (root=2), SAC's settings of the car", "sb3_lac:LAC", None),
     "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC", _SQUARE_ROOT),
     "lac_fourth_root": ("LAC (root=4)", "sb3_lac:LAC", _FOURTH_ROOT),
     "lac_higher_start": ("LAC (root=4), entropy from 1", "sb3_lac:LAC", {"ent_coef": "auto", **_FOURTH_ROOT}),
@@ -77,6 +77,7 @@ _CAR = {
     "use_sde": True,
     "policy_kwargs": "dict(log_std_init=-3.67, net_arch=[64, 64], use_expln=True)",
 }
+_CAR_OF_LAC = {**_CAR, "policy_kwargs": "dict(log_std_init=-3.67, net_arch=[64, 64], use_expln=True, root=2)"}
 #: The RL Zoo's settings for a task, where it tunes for at most 50 thousand steps.
 TUNED: dict[str, dict[str, dict[str, Any]]] = {
     "Pendulum-v1": {
@@ -94,7 +95,7 @@ TUNED: dict[str, dict[str, dict[str, Any]]] = {
         },
         "tqc": {"learning_rate": 1e-3},
     },
-    "MountainCarContinuous-v0": {"lac_zoo": _CAR, "sac": _CAR, "tqc": _CAR},
+    "MountainCarContinuous-v0": {"lac_zoo": _CAR_OF_LAC, "sac": _CAR, "tqc": _CAR},
 }
 EPISODES = 20
 _CURVE = {100 * point // POINTS: f"after_{100 * point // POINTS}_percent" for point in range(1, POINTS + 1)}

@@ -31,7 +31,8 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import COLOUR_OF, COLOURS
 from benchmarks.control import tried_with
-from benchmarks.stabilisation import REFERENCE, Contender, in_order, parts_of, undisturbed_text
+from benchmarks.runs import Run
+from benchmarks.stabilisation import REFERENCE, Contender, in_order, parts_of, trained, undisturbed_text
 from benchmarks.study import (
     Study,
     Tables,
@@ -150,7 +151,7 @@ def contender(policy: str, env_id: str) -> Contender:
     own["policy_kwargs"] = {"net_arch": {"pi": [64, 64], "qf": layers}}
     if env_id == "Oscillator-v0":
         own["env_wrapper"] = "benchmarks.published.EndFarAway"
-    return Contender(algo, label, *STYLES[label], "published_lac", own, compiles=policy in HORIZONS)
+    return Contender(algo, label, *STYLES[label], "published_lac", own)
 
 
 def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> list[dict[str, Any]]:
@@ -167,8 +168,7 @@ def part(
     policy: str,
     env_id: str,
     seed: int | None,
-    timesteps: int | None,
-    recipe: str | None,
+    run: dict[str, Any] | None,
     episodes: int,
     models: Path,
     compiled: bool,
@@ -176,20 +176,17 @@ def part(
     """Train a policy, or take the reference controller, and try it."""
     predictor: PolicyPredictor
     described: dict[str, Any] = {"environment": env_id, "policy": policy, "seed": seed}
-    learning = None
-    if policy == REFERENCE:
+    tables, weight = {}, None
+    if run is None:
         predictor = reference_controller(gym.make(env_id))
-        trained: dict[str, Any] = {"timesteps": None, "updates": None, "lambda": None, "training_minutes": None}
+        took: dict[str, Any] = dict.fromkeys(("timesteps", "updates", "training_minutes"))
     else:
-        assert seed is not None
-        chosen, folder = contender(policy, env_id), models / f"{env_id}_{policy}_seed{seed}"
-        made_from = chosen.recipe(env_id, seed, timesteps)
-        predictor, updates, minutes, learning = chosen.trained(made_from, recipe, folder, compiled)
-        described["policy"] = chosen.label
+        predictor, took, learning = trained(Run(**run), models, compiled)
+        described["policy"] = run["algorithm"]
         weight = predictor.log_lambda.exp().item() if isinstance(predictor, PublishedLAC) else None
-        trained = {"timesteps": timesteps, "updates": updates, "lambda": weight, "training_minutes": minutes}
-    results = pd.DataFrame([described | trained | row for row in tried(predictor, env_id, episodes)])
-    return {"published": results} | ({} if learning is None else {"learning": learning.assign(**described)})
+        tables["learning"] = learning.assign(**described)
+    rows = [{**described, **took, "lambda": weight, **row} for row in tried(predictor, env_id, episodes)]
+    return {"published": pd.DataFrame(rows), **tables}
 
 
 def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:

@@ -6,6 +6,7 @@ and numbers as readers see them. A study itself keeps its configuration, the fun
 from __future__ import annotations
 
 import argparse
+import gzip
 import importlib
 import inspect
 import json
@@ -43,6 +44,8 @@ Tables = Mapping[str, pd.DataFrame]
 SYMBOLS = {"q_mobile": "q_max", "r_o": "R_o"}
 #: Seed of evaluations; no training seed comes close.
 EVALUATION_SEED = 10_000
+#: Larger tables are packed with gzip.
+LARGEST_PLAIN_TABLE_BYTES = 100_000
 
 _PACKAGES = (
     *("torch", "stable_baselines3", "sb3_contrib", "gymnasium", "mujoco"),
@@ -84,6 +87,32 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else str(value)
+
+
+def table_file(folder: Path, name: str) -> Path:
+    """The file of a table, ``NAME.csv.gz`` if that is there and ``NAME.csv`` otherwise; ``pandas.read_csv`` reads both."""
+    packed = folder / f"{name}.csv.gz"
+    return packed if packed.exists() else folder / f"{name}.csv"
+
+
+def read_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """All tables of a folder, by name."""
+    names = sorted({path.name.partition(".csv")[0] for path in folder.glob("*.csv*")})
+    return {name: pd.read_csv(table_file(folder, name)) for name in names}
+
+
+def write_csv(folder: Path, name: str, text: str) -> None:
+    """Write the text of a table in place of what it was before: packed if it is large, with equal bytes for equal text."""
+    packed, plain = folder / f"{name}.csv.gz", folder / f"{name}.csv"
+    content = text.encode()
+    file, other = (packed, plain) if len(content) > LARGEST_PLAIN_TABLE_BYTES else (plain, packed)
+    with replacing(file) as part, part.open("wb") as stream:
+        if file is packed:
+            with gzip.GzipFile("", "wb", fileobj=stream, mtime=0) as compressed:
+                compressed.write(content)
+        else:
+            stream.write(content)
+    other.unlink(missing_ok=True)
 
 
 def digest_of(content: Mapping[str, Any]) -> str:
@@ -306,7 +335,7 @@ class Study:
         to keep itself. To redraw, no part is made: the tables are those that are written.
         """
         if self.redraws:
-            written = {file.stem: pd.read_csv(file) for file in sorted(self.out.glob("*.csv"))}
+            written = read_tables(self.out)
             # a text that is empty comes back as one
             texts = {name: table.select_dtypes(exclude=["number", "bool"]).columns for name, table in written.items()}
             return {name: table.fillna(dict.fromkeys(texts[name], "")) for name, table in written.items()}
@@ -379,12 +408,12 @@ class Study:
                     yield started[future], future.result
 
     def write_table(self, name: str, table: pd.DataFrame, configuration: Mapping[str, Any] | None = None) -> None:
-        """Write a table as CSV, and beside it as JSON what made it: command, configuration, versions."""
+        """Write a table, and beside it as JSON what made it: command, configuration, versions."""
         configuration = self.configuration if configuration is None else configuration
         write_json(
             self.out / f"{name}.json", {"command": self.command, "configuration": configuration, "versions": versions()}
         )
-        write_text(self.out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
+        write_csv(self.out, name, table.to_csv(index=False, float_format="%.6g"))
 
     def write(self, tables: Tables, figures: Mapping[str, Figure], text: str, name: str | None = None) -> None:
         """Write what came out, and show the text."""

@@ -3,8 +3,6 @@
 import json
 from functools import partial
 
-import pandas as pd
-
 from benchmarks import (
     calibrators,
     direct_mapping,
@@ -13,6 +11,7 @@ from benchmarks import (
     speed,
     stabilisation,
 )
+from benchmarks.study import read_tables
 from checks.pages import DOCS
 
 PUBLISHED = DOCS / "results"
@@ -49,6 +48,6 @@ REPORTS = {
 
 def test_what_is_shown_is_what_the_reports_say_of_the_published_tables():
     for name, report in REPORTS.items():
-        tables = {path.stem: pd.read_csv(path) for path in (PUBLISHED / name).parent.glob("*.csv")}
+        tables = read_tables((PUBLISHED / name).parent)
         shown = (PUBLISHED / f"{name}.md").read_text(encoding="utf-8")
         assert report(tables) == shown, f"{name}: run the study with --redraw"
