@@ -37,7 +37,7 @@ from battery_env.lab.sources import VOLTAGE, Source, few_of, find_sources, read_
 from battery_env.loads import constant
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
-from battery_env.records.refusals import Origin, RecordError
+from battery_env.records.refusals import Advice, Origin, RecordError
 from battery_env.records.samples import check_cut_off
 
 #: What the process returns: all records settled, one or more refused, one or more not settled, stopped, nobody reads on.
@@ -519,7 +519,8 @@ def _columns(arguments: Sequence[str]) -> int:
     with replacing(options.out, new=True) as part:
         part.write_text(tester_file(found.columns, opened.names, opened.rows), encoding="utf-8")
     then = "Fill in what is not found" if found.missing else "Change what is wrong"
-    print(f"\nwritten: {options.out}. {then}, and calibrate: {_NAME} {options.record} --tester {options.out}")
+    command = Origin(str(options.record)).command(Advice(then, "tester", options.out))
+    print(f"\nwritten: {options.out}. {then}, and calibrate: {command}")
     return NOT_SETTLED if found.missing else SETTLED
 
 
