@@ -21,7 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
-from battery_env.compiled import saying_that_it_compiles
+from battery_env.compiled import announce_compilation
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.estimators.joint_fit import fit_cell
 from battery_env.estimators.search import spread_over
@@ -359,7 +359,7 @@ def _calibrate_all(
         absent = f", {results.absent} of them of files that are not there now" if results.absent else ""
         print(f"going on: {done} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True)
     try:
-        with workers(options.jobs, options.scheduler) as executor, saying_that_it_compiles():
+        with workers(options.jobs, options.scheduler) as executor, announce_compilation():
             ahead = 64 if options.scheduler or options.jobs < 1 else 2 * options.jobs
             for outcome in calibrate_all(sources, file_format, settings, results, executor, ahead):
                 _report(outcome, options.json)
@@ -446,7 +446,7 @@ def _fit(arguments: Sequence[str]) -> int:
         check_cut_off(options.cut_off)
     discharges = _discharges(options.records, _file_format(options))
     print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
-    with warnings.catch_warnings(), saying_that_it_compiles():
+    with warnings.catch_warnings(), announce_compilation():
         warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
         found = fit_cell(discharges, options.cut_off)
     print(found.summary())
@@ -474,7 +474,7 @@ def _forecast(arguments: Sequence[str]) -> int:
     figure = figure_of(options.record, options.out) if options.out else None
     if figure:
         check_new(figure)
-    with _saying(), saying_that_it_compiles():
+    with _saying(), announce_compilation():
         end = end_of_record(options.record, settings, file_format, options.life, options.load)
     print(json.dumps(end.row()) if options.json else end.text())
     if figure:

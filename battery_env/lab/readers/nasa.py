@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from battery_env.arrays import FloatArray
-from battery_env.files import call_alone
+from battery_env.files import call_in_process
 from battery_env.records.discharge import NASA_CITATION
 
 
@@ -17,7 +17,7 @@ def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """Return the unchecked discharges of one of NASA's own files."""
     content: dict[str, Any] = {}
     try:
-        content = call_alone("scipy.io", "loadmat", str(path), simplify_cells=True)
+        content = call_in_process("scipy.io", "loadmat", str(path), simplify_cells=True)
         ((cell, value),) = ((name, value) for name, value in content.items() if isinstance(value, dict) and "cycle" in value)
         return _samples_of_mat(cell, value)
     except Exception as error:  # scipy raises errors of many types, and any field may be missing
