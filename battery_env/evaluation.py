@@ -205,8 +205,8 @@ def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:
         "bound_percent": (100.0 * scores[f"{parameter}_bound"] / true).mean(),
         "settling_time_1_percent_s": scores[f"{parameter}_settling_time_1_percent_s"].median(),
     }
-    for when in ("", *(f"_at_{percent}_percent" for percent in FORECAST_PERCENT)):
-        summary[f"eod_error_percent{when}"] = (100.0 * scores[f"eod_error{when}_s"].abs() / scores["eod_time_s"]).mean()
+    for suffix in ("", *(f"_at_{percent}_percent" for percent in FORECAST_PERCENT)):
+        summary[f"eod_error_percent{suffix}"] = (100.0 * scores[f"eod_error{suffix}_s"].abs() / scores["eod_time_s"]).mean()
     return {name: float(value) for name, value in summary.items()}
 
 

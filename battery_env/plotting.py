@@ -86,9 +86,9 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     :param figure: the figure
     :param path: the file; its suffix chooses the format
     """
-    with replacing(path) as part:
+    with replacing(path) as temporary:
         # not the resolution of matplotlib's settings, which other libraries change
-        figure.savefig(part, dpi="figure", metadata=titles_of(figure) if part.suffix == ".png" else None)
+        figure.savefig(temporary, dpi="figure", metadata=titles_of(figure) if temporary.suffix == ".png" else None)
     return Path(path)
 
 

@@ -225,20 +225,18 @@ class TrajectoryDataset(Sequence[Trajectory]):
         if units not in ({"power"}, {"current"}):
             raise ValueError(f"loads must be Loads, all in one unit (power or current), got {sorted(units)}")
         index = np.broadcast_to(check_indices("load_index", load_index, len(loads)), q.shape)
-        known = np.ones(1) if factors is None else np.asarray(factors, dtype=np.float64)
-        multiples = np.broadcast_to(known, (q.size, len(UNCERTAIN_CONSTANTS))).copy()
-        added_V = np.broadcast_to(
-            0.0 if equilibrium_V is None else np.asarray(equilibrium_V), (q.size, EQUILIBRIUM_SIZE)
-        ).copy()
+        factors = np.broadcast_to(1.0 if factors is None else factors, (q.size, len(UNCERTAIN_CONSTANTS)))
+        added_V = np.broadcast_to(0.0 if equilibrium_V is None else equilibrium_V, (q.size, EQUILIBRIUM_SIZE))
+        factors, added_V = np.array(factors, dtype=np.float64, order="C"), np.array(added_V, dtype=np.float64, order="C")
         cell = check_cell(cell, thermal)
-        dt_s = _check_dt(dt_s, cell, multiples)
+        dt_s = _check_dt(dt_s, cell, factors)
         if dt_s < _LEAST_DT_S:
             raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of it must fit in memory), got {dt_s!r}")
-        profiles, samples, checkpoints = _simulate(q, r, loads, index, dt_s, thermal, cell, multiples, added_V)
+        profiles, samples, checkpoints = _simulate(q, r, loads, index, dt_s, thermal, cell, factors, added_V)
         return TrajectoryDataset(
             q_mobile=np.array(q),
             r_o=np.array(r),
-            factors=multiples,
+            factors=factors,
             equilibrium_V=added_V,
             eod_time_s=np.asarray(samples * dt_s, dtype=np.float64),
             load_values=np.concatenate(profiles),

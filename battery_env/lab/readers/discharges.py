@@ -192,18 +192,19 @@ def _split(rows: pd.DataFrame, origin: Origin) -> list[Recording]:
     candidates = [candidate for candidate in candidates if candidate.drawn_C >= LOAD_SHARE * largest_C]
     histories = [ChargeHistory(charge=_charge_before(rows, candidate.charge)) for candidate in candidates]
     meta: dict[str, Any] = {"source": origin.source}
-    metas = [meta | {"cycle": number} for number in range(1, len(candidates) + 1)] if len(candidates) > 1 else [meta]
-    tables, has_own_clock = [rows.iloc[candidate.rows] for candidate in candidates], len(candidates) > 1
-    return [_recording(*entry, has_own_clock, origin) for entry in zip(tables, histories, metas, strict=True)]
+    tables, is_several = [rows.iloc[candidate.rows] for candidate in candidates], len(candidates) > 1
+    metas = [meta | {"cycle": number} for number in range(1, len(candidates) + 1)] if is_several else [meta]
+    entries = zip(tables, histories, metas, strict=True)
+    return [_recording(table, history, entry, is_several, origin) for table, history, entry in entries]
 
 
 def _no_discharge(rows: pd.DataFrame) -> RecordError:
     """Return the error for rows without a discharge: a charge, if the voltage rises."""
     time_s, voltage_V, current_A = (rows[name].to_numpy() for name in REQUIRED)
     charged_Ah = -float(_net_charge_C(time_s, current_A)[-1]) / 3600.0
-    begin_V, end_V = voltage_V[current_A < 0.0][[0, -1]] if (current_A < 0.0).any() else (0.0, 0.0)
-    if end_V > begin_V:
-        return RecordError(f"there is no discharge, but a charge of {charged_Ah:.4g} Ah, from {begin_V:.2f} to {end_V:.2f} V")
+    start_V, end_V = voltage_V[current_A < 0.0][[0, -1]] if (current_A < 0.0).any() else (0.0, 0.0)
+    if end_V > start_V:
+        return RecordError(f"there is no discharge, but a charge of {charged_Ah:.4g} Ah, from {start_V:.2f} to {end_V:.2f} V")
     return RecordError("there is no discharge, as no charge is drawn: check the sign of the current", SIGNS)
 
 

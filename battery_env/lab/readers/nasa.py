@@ -22,8 +22,8 @@ def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
         return _samples_of_mat(cell, value)
     except Exception as error:  # scipy raises errors of many types, and any field may be missing
         names = ", ".join(name for name in content if not name.startswith("__"))
-        where = f"one of its variables ({names}) must be a cell with its cycles" if content else error
-        raise ValueError(f"the file is damaged, or not laid out as NASA's battery files: {where}") from error
+        problem = f"one of its variables ({names}) must be a cell with its cycles" if content else error
+        raise ValueError(f"the file is damaged, or not laid out as NASA's battery files: {problem}") from error
 
 
 def _samples_of_mat(cell: str, value: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:

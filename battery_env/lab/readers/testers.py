@@ -173,7 +173,7 @@ def merge(first: Tester, *fallbacks: Tester) -> Tester:
 #: All rows in order of trial; the last row has the names of all.
 TESTERS = (*_NAMED_TESTERS, merge(_PLAIN, *_NAMED_TESTERS))
 #: Encodings other than UTF-8.
-ENCODINGS = tuple(dict.fromkeys(each.encoding for each in (_PLAIN, *_NAMED_TESTERS) if each.encoding))
+ENCODINGS = tuple(dict.fromkeys(tester.encoding for tester in (_PLAIN, *_NAMED_TESTERS) if tester.encoding))
 
 
 def find_tester(name: str | Path | Tester | None) -> Tester | None:
