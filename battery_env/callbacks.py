@@ -91,7 +91,7 @@ class CalibrationCallback(EventCallback):
 
         self.evaluate = evaluate
         self.eval_freq = eval_freq
-        # The names to log by column: if none are chosen, they are those of the training environment
+        # Names in the log by column; without a choice the training environment names them
         self.metrics = dict(metrics) if isinstance(metrics, Mapping) else {column: column for column in metrics or ()}
         self.log_path = None if log_path is None else Path(log_path)
         self.best_model_save_path = None if best_model_save_path is None else Path(best_model_save_path)
@@ -114,7 +114,7 @@ class CalibrationCallback(EventCallback):
 
     @property
     def best_mean_reward(self) -> float:
-        """What the callbacks of Stable-Baselines3 that stop a training ask for: the higher, the better."""
+        """The score for callbacks of Stable-Baselines3 that stop a training: the higher, the better."""
         return -self.best_objective
 
     def _init_callback(self) -> None:
@@ -123,7 +123,7 @@ class CalibrationCallback(EventCallback):
         if not self.metrics:
             self.metrics = self._default_metrics()
         if self.eval_freq > 0:
-            # A mistake is seen before the training, and not at its first evaluation
+            # A mistake shows before the training, instead of at its first evaluation
             self._summarize(self.evaluate(self.model))
         if self.best_model_save_path is not None:
             self.best_model_save_path.mkdir(parents=True, exist_ok=True)
@@ -166,23 +166,23 @@ class CalibrationCallback(EventCallback):
                 print(f"New best {self.objective}!")
             self.best_objective = objective
             if self.best_model_save_path is not None:
-                with replacing(self.best_model_save_path / "best_model.zip") as part:
-                    self.model.save(part)
+                with replacing(self.best_model_save_path / "best_model.zip") as temporary:
+                    self.model.save(temporary)
         # Trigger callback after every evaluation, if needed
         return self._on_event()
 
     def _add_to_history(self, entry: dict[str, float]) -> None:
-        """Keep an evaluation, in place of an older one after as many timesteps (when continuing from a checkpoint)."""
-        others = [old for old in self.history if old["timesteps"] != entry["timesteps"]]
-        self.history = sorted([*others, entry], key=lambda evaluation: evaluation["timesteps"])
+        """Add an evaluation, in place of an older one at the same timestep (when continuing from a checkpoint)."""
+        history = [evaluation for evaluation in self.history if evaluation["timesteps"] != entry["timesteps"]]
+        self.history = sorted([*history, entry], key=lambda evaluation: evaluation["timesteps"])
         if self.log_path is not None:
-            with replacing(self.log_path) as part:
-                pd.DataFrame(self.history).to_csv(part, index=False)
+            with replacing(self.log_path) as temporary:
+                pd.DataFrame(self.history).to_csv(temporary, index=False)
 
     def _record_figures(self, trajectories: pd.DataFrame) -> None:
         for parameter in PARAMETER_NAMES:
-            needed = {parameter, "load", *(f"{parameter}_{column}" for column in ("hat", "spread", "mape_percent"))}
-            if needed <= set(trajectories.columns) and any(column.startswith(f"{parameter}_") for column in self.metrics):
+            required = {parameter, "load", *(f"{parameter}_{column}" for column in ("hat", "spread", "mape_percent"))}
+            if required <= set(trajectories.columns) and any(column.startswith(f"{parameter}_") for column in self.metrics):
                 figure = plot_true_against_inferred({f"{self.num_timesteps} steps": trajectories}, parameter)
                 self.logger.record(
                     f"calibration/{parameter}_inferred",
@@ -192,8 +192,8 @@ class CalibrationCallback(EventCallback):
 
     def _summarize(self, trajectories: pd.DataFrame) -> dict[str, float]:
         """
-        Mean and worst value of each metric. A trajectory without a result (NaN) is not left out:
-        it makes both of them NaN, and such a model is never the best.
+        Return mean and worst value of each metric. A trajectory without a result (NaN) makes both NaN, and such a model is
+        never the best.
         """
         missing = [column for column in self.metrics if column not in trajectories.columns]
         if missing:

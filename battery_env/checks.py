@@ -1,4 +1,4 @@
-"""Refuses invalid arguments; each check returns what it was given, converted."""
+"""Checks of arguments: each check refuses invalid values, and returns the converted value."""
 
 from __future__ import annotations
 
@@ -16,36 +16,37 @@ from battery_env.arrays import FloatArray, IntArray
 
 LoadUnit = Literal["power", "current"]
 
-#: Largest magnitude of the load of one cell, per unit. Beyond it a value is taken for a mistake in the unit (mA for A).
+#: Largest magnitude of the load of one cell, per unit; a larger value is probably in another unit (mA for A).
 LOAD_LIMITS: dict[str, float] = {"power": 5000.0, "current": 1000.0}
 LOAD_UNIT_SYMBOLS: dict[str, str] = {"power": "W", "current": "A"}
 #: 0 degC in K.
 ZERO_CELSIUS_K = 273.15
 
 
-def check_options(caller: str, given: Iterable[str], known: Collection[str]) -> None:
-    """Refuse an option that there is not, with the one that may be meant."""
-    for name in given:
-        if name not in known:
-            meant = get_close_matches(name, known, 1)
-            raise TypeError(f"{caller} takes no {name!r}: " + (f"did you mean {meant[0]}?" if meant else f"give {[*known]}"))
+def check_options(caller: str, names: Iterable[str], options: Collection[str]) -> None:
+    """Refuse an unknown option, and suggest a similar one."""
+    for name in names:
+        if name not in options:
+            matches = get_close_matches(name, options, 1)
+            hint = f"did you mean {matches[0]}?" if matches else f"give {[*options]}"
+            raise TypeError(f"{caller} takes no {name!r}: {hint}")
 
 
-def hinting(made: Any) -> Any:
-    """A dataclass that names the option that may be meant, where it is given one that it does not have."""
-    init: Callable[..., None] = made.__init__
+def with_option_hints(dataclass: Any) -> Any:
+    """Make a dataclass suggest a similar option for an unknown one."""
+    init: Callable[..., None] = dataclass.__init__
 
     @wraps(init)
-    def checked(self: Any, *arguments: Any, **options: Any) -> None:
-        check_options(made.__name__, options, made.__dataclass_fields__)
+    def checked_init(self: Any, *arguments: Any, **options: Any) -> None:
+        check_options(dataclass.__name__, options, dataclass.__dataclass_fields__)
         init(self, *arguments, **options)
 
-    made.__init__ = checked
-    return made
+    dataclass.__init__ = checked_init
+    return dataclass
 
 
 def check_real(name: str, values: object) -> None:
-    """Refuse truth values and complex numbers, of which numpy makes other numbers."""
+    """Refuse truth values and complex numbers, which numpy would convert."""
     array = np.asarray(values, dtype=None if hasattr(values, "dtype") else object)
     for value in array.flat if array.dtype.kind == "O" else array.flat[:1]:
         if isinstance(value, bool | np.bool_ | complex | np.complexfloating):
@@ -53,7 +54,7 @@ def check_real(name: str, values: object) -> None:
 
 
 def check_numbers(name: str, values: ArrayLike, unit: str = "") -> FloatArray:
-    """Refuse what is no number."""
+    """Refuse values that are no numbers."""
     check_real(name, values)
     try:
         return np.asarray(values, dtype=np.float64)
@@ -65,40 +66,40 @@ def check_numbers(name: str, values: ArrayLike, unit: str = "") -> FloatArray:
 def check_within(name: str, values: ArrayLike, limits: tuple[float, float], unit: str, hint: str) -> FloatArray:
     """Refuse values beyond their limits."""
     array = check_numbers(name, values, unit)
-    inside = (array >= limits[0]) & (array <= limits[1])
-    if not inside.all():
-        worst = array[~inside].flat[0]
-        raise ValueError(f"{name} must lie within {limits[0]:g} .. {limits[1]:g} {unit}, got {worst:g}. {hint}")
+    is_within = (array >= limits[0]) & (array <= limits[1])
+    if not is_within.all():
+        outlier = array[~is_within].flat[0]
+        raise ValueError(f"{name} must lie within {limits[0]:g} .. {limits[1]:g} {unit}, got {outlier:g}. {hint}")
     return array
 
 
-def check_range(name: str, ends: tuple[float, float]) -> tuple[float, float]:
-    """Refuse what is not two finite numbers in ascending order."""
+def check_range(name: str, limits: tuple[float, float]) -> tuple[float, float]:
+    """Refuse limits that are not two finite numbers in ascending order."""
     try:
-        low, high = map(float, ends)
+        low, high = map(float, limits)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be two numbers, lower and upper end, got {ends!r}") from error
+        raise TypeError(f"{name} must be two numbers, lower and upper end, got {limits!r}") from error
     if not -np.inf < low <= high < np.inf:
-        raise ValueError(f"{name} must be finite and increasing, got {ends!r}")
+        raise ValueError(f"{name} must be finite and increasing, got {limits!r}")
     return low, high
 
 
 def check_positive(name: str, value: float) -> float:
-    """Refuse what is not a positive number."""
+    """Refuse a value that is not a positive, finite number."""
     if not isinstance(value, Real) or not 0.0 < value < np.inf:
         raise ValueError(f"{name} must be a positive, finite number, got {value!r}")
     return float(value)
 
 
 def check_not_negative(**values: float) -> None:
-    """Refuse what is negative, or no finite number."""
+    """Refuse values that are negative or not finite."""
     for name, value in values.items():
         if not 0.0 <= value < np.inf:
             raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
 
 
 def check_whole_number(name: str, value: int) -> int:
-    """Refuse what is no whole number."""
+    """Refuse a value that is no whole number."""
     try:
         return operator.index(value)
     except TypeError as error:
@@ -106,7 +107,7 @@ def check_whole_number(name: str, value: int) -> int:
 
 
 def check_indices(name: str, values: ArrayLike, size: int) -> IntArray:
-    """Refuse what does not index a sequence."""
+    """Refuse invalid indices of a sequence."""
     try:
         array = np.asarray(values)
     except ValueError as error:

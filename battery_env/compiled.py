@@ -1,4 +1,4 @@
-"""How kernels are compiled (numba): once, and kept for later processes where there is a place to keep them."""
+"""Compilation of kernels (numba), with a cache for later processes where a folder is writable."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ _IMPORT = re.compile(r"^from (battery_env[\w.]*) import (\([^)]*\)|.*)$", re.MUL
 
 @cache
 def digest_of_kernels(package: Path = _PACKAGE) -> str:
-    """Of the modules that hold kernels, and of those that these import from: their numbers are compiled in."""
+    """Return a digest of the modules with kernels and of their imports, whose constants are compiled in."""
     texts: dict[str, str] = {}
     for path in sorted(package.rglob("*.py")):
         name = ".".join(path.relative_to(package.parent).with_suffix("").parts).removesuffix(".__init__")
         texts[name] = path.read_text(encoding="utf-8")
-    needed = [name for name, text in texts.items() if "from battery_env.compiled import" in text]
-    for name in needed:  # which grows meanwhile
+    modules = [name for name, text in texts.items() if "from battery_env.compiled import" in text]
+    for name in modules:  # the loop appends to this list
         for module, names in _IMPORT.findall(texts[name]):
-            for each in (module, *(f"{module}.{name}" for name in re.findall(r"\w+", names))):
-                if each in texts and each not in needed:
-                    needed.append(each)
-    return sha256("".join(f"{name}\n{texts[name]}" for name in sorted(needed)).encode()).hexdigest()
+            for dependency in (module, *(f"{module}.{name}" for name in re.findall(r"\w+", names))):
+                if dependency in texts and dependency not in modules:
+                    modules.append(dependency)
+    return sha256("".join(f"{name}\n{texts[name]}" for name in sorted(modules)).encode()).hexdigest()
 
 
 @cache
 def forget_outdated(folder: Path, digest: str) -> None:
     """
-    Remove the kernels in a folder if they were compiled from other code. Numba compares each with its own module alone: after
-    an update in place, as by git, it would mix kernels of two versions.
+    Remove the kernels in a folder that were compiled from other code. Numba compares a kernel only with its module: after an
+    update in place, as by git, it would mix kernels of two versions.
     """
-    compiled_from = folder / "battery_env.sha256"
-    with suppress(OSError):  # another process is as fast, or nothing may be written here
-        if not compiled_from.exists() or compiled_from.read_text(encoding="utf-8") != digest:
-            for kept in folder.glob("*.nbi"):
-                kept.unlink(missing_ok=True)
+    digest_file = folder / "battery_env.sha256"
+    with suppress(OSError):  # another process was faster, or the folder is not writable
+        if not digest_file.exists() or digest_file.read_text(encoding="utf-8") != digest:
+            for index_file in folder.glob("*.nbi"):
+                index_file.unlink(missing_ok=True)
             folder.mkdir(parents=True, exist_ok=True)
-            compiled_from.write_text(digest, encoding="utf-8")
+            digest_file.write_text(digest, encoding="utf-8")
 
 
-def _kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def _jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def compiled(function: Callable[..., Any]) -> Any:
         try:
             kernel = njit(cache=True, error_model="numpy", **options)(function)
-        except RuntimeError:  # neither the package nor a home can be written to
+        except RuntimeError:  # neither the package nor the home folder is writable
             return njit(error_model="numpy", **options)(function)
         forget_outdated(Path(kernel.stats.cache_path), digest_of_kernels())
         return kernel
@@ -61,21 +61,21 @@ def _kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
-compiled = _kept()
-# the compiler makes vector loops only of what is inlined
-inlined = _kept(forceinline=True)
-# sums in any order, which vector instructions need
-reassociating = _kept(fastmath={"reassoc"})
+compiled = _jit()
+# the compiler vectorises only loops of inlined functions
+inlined = _jit(forceinline=True)
+# sums in any order, as vector instructions need
+reassociating = _jit(fastmath={"reassoc"})
 
 
 class _FirstCompilation(event.Listener):
-    """Says on stderr, once, that kernels are compiled."""
+    """Print once, on stderr, that kernels are being compiled."""
 
-    has_spoken = False
+    is_announced = False
 
     def on_start(self, event: event.Event) -> None:
-        if not self.has_spoken:
-            self.has_spoken = True
+        if not self.is_announced:
+            self.is_announced = True
             print("compiling, once after an installation or update: half a minute", file=sys.stderr, flush=True)
 
     def on_end(self, event: event.Event) -> None:
@@ -83,7 +83,7 @@ class _FirstCompilation(event.Listener):
 
 
 @contextmanager
-def saying_that_it_compiles() -> Iterator[None]:
-    """Whoever waits is told why, where kernels are not kept from an earlier process."""
+def announce_compilation() -> Iterator[None]:
+    """Announce a compilation of kernels within the block."""
     with event.install_listener("numba:compile", _FirstCompilation()):
         yield

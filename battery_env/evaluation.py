@@ -21,7 +21,7 @@ from battery_env.records.model import RecordModel
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.trajectories import TrajectoryDataset
 
-#: The end of discharge is also forecast with the estimates held at these times, as shares of its true time.
+#: Times of further forecasts of the end of discharge, in % of its true time.
 FORECAST_PERCENT = (25, 50, 75)
 
 
@@ -42,20 +42,20 @@ def evaluate(
       scores = evaluate(ClosedForm(), test[::100])
       print(scores[["r_o", "r_o_hat", "r_o_mape_percent"]])
 
-    Look at ``scores["p_mape_percent"].max()``, the worst discharge, beside the mean; :func:`summarize` has both.
+    Look also at ``scores["p_mape_percent"].max()``, the worst discharge; :func:`summarize` has both.
 
     Columns for each parameter p (``q_mobile`` in C, ``r_o`` in ohm):
 
     ==================================== =============================================================================
     ``p``                                the true value
-    ``p_hat``, ``p_final``               mean of its estimates, the last one
+    ``p_hat``, ``p_final``               mean of the estimates, last estimate
     ``p_worst``                          largest absolute error
     ``p_mape_percent``                   mean absolute error, % of the true value
-    ``p_second_half_mape_percent``       likewise, of the estimates in the second half of the discharge
-    ``p_final_error_percent``            likewise, of the last one
+    ``p_second_half_mape_percent``       the same over the second half of the discharge
+    ``p_final_error_percent``            the same of the last estimate
     ``p_bias``, ``p_spread``             mean error, standard deviation of the estimates
-    ``p_settling_time_1_percent_s``      time since the first sample from which on all estimates are that close; infinite
-                                         if the last one is not
+    ``p_settling_time_1_percent_s``      time since the first sample after which all estimates are within 1 %; infinite if
+                                         the last estimate is not
     ``p_coverage_percent``               share of the estimates within two stated standard deviations of the truth
     ``p_bound``                          the Cramér-Rao bound: least standard deviation of an unbiased calibrator with
                                          these sensors
@@ -64,16 +64,15 @@ def evaluate(
     The bound uses all samples of the voltage. Its unknowns are the parameters with a stated uncertainty (both, if the
     calibrator states none) and the offset of the voltage, if there is one.
 
-    And of each discharge:
+    Columns for each discharge:
 
     ==================================== =============================================================================
     ``load``                             mean of the record, W or A
-    ``eod_time_s``                       its end
-    ``eod_error_s``                      end predicted from full charge with the last estimate, minus the true one
-    ``eod_error_at_25_percent_s``, ...   likewise with the estimate held after 25, 50, 75 % of the time. The load goes on
-                                         as recorded
-    ``settled_time_s``                   time since the first sample from which on the calibrator says that it has settled;
-                                         infinite if it does not in the end
+    ``eod_time_s``                       end of discharge
+    ``eod_error_s``                      end predicted from full charge with the last estimate, minus the true end
+    ``eod_error_at_25_percent_s``, ...   the same with the estimate after 25, 50, 75 % of the time, under the recorded load
+    ``settled_time_s``                   time since the first sample after which all estimates are settled; infinite if the
+                                         last estimate is not
     ``updates``                          number of estimates
     ``time_per_update_s``                wall time of the whole batch over its number of estimates
     ==================================== =============================================================================
@@ -88,20 +87,22 @@ def evaluate(
     :return: one row per discharge, in their order
     """
     dataset = data if isinstance(data, TrajectoryDataset) else TrajectoryDataset.from_trajectories(data)
-    # on the clock of the data set, in which single trajectories start at 0
+    # on the clock of the data set, where single trajectories start at 0
     truth = data if isinstance(data, TrajectoryDataset) else [_from_zero(record) for record in data]
-    seen: Sequence[Trajectory] = truth
-    drawn: list[SensorErrors | None] = [None] * len(truth)
+    measured: Sequence[Trajectory] = truth
+    errors_of: list[SensorErrors | None] = [None] * len(truth)
     if sensor_errors is not None:
         generators = [np.random.default_rng((seed, n)) for n in range(len(truth))]
-        drawn = [sensor_errors.draw(rng) for rng in generators]
-        seen = [each.apply(record, rng) for each, record, rng in zip(drawn, truth, generators, strict=True) if each]
+        errors_of = [sensor_errors.draw(rng) for rng in generators]
+        measured = [
+            errors.apply(record, rng) for errors, record, rng in zip(errors_of, truth, generators, strict=True) if errors
+        ]
     start = time.perf_counter()
-    traces = estimator.trace(seen)
+    traces = estimator.trace(measured)
     elapsed_s = time.perf_counter() - start
     updates = sum(len(trace.time_s) for trace in traces)
     rows = []
-    for n, (record, trace, errors) in enumerate(zip(truth, traces, drawn, strict=True)):
+    for n, (record, trace, errors) in enumerate(zip(truth, traces, errors_of, strict=True)):
         row: dict[str, float] = {"trajectory": n}
         for name in PARAMETERS:
             row |= _errors(name, record, trace)
@@ -144,32 +145,32 @@ def _errors(name: str, record: Trajectory, trace: EstimateTrace) -> dict[str, fl
 
 
 def _since(holds: BoolArray, time_s: FloatArray) -> float:
-    """The time of the first estimate from which on something holds."""
+    """Return the time of the first estimate from which on a condition holds."""
     fails = np.flatnonzero(~holds)
     first = fails[-1] + 1 if len(fails) else 0
     return float(time_s[first]) if first < len(time_s) else np.inf
 
 
 def _forecasts(dataset: TrajectoryDataset, n: int, record: Trajectory, trace: EstimateTrace) -> dict[str, float]:
-    """Errors of the end that single estimates of one discharge predict."""
+    """Return the errors of the ends predicted with single estimates of one discharge."""
     columns = [f"eod_error_at_{percent}_percent_s" for percent in FORECAST_PERCENT]
-    held_s = 0.01 * np.array(FORECAST_PERCENT) * record.eod_time_s
-    at = [len(trace.time_s) - 1, *(np.searchsorted(trace.time_s, held_s, side="right") - 1)]
+    decision_s = 0.01 * np.array(FORECAST_PERCENT) * record.eod_time_s
+    estimate_rows = [len(trace.time_s) - 1, *(np.searchsorted(trace.time_s, decision_s, side="right") - 1)]
     load = dataset.load_profile(n)
-    # beyond the record its last load goes on, for as long again
+    # beyond the record the last load continues, for as long again
     load = np.concatenate([load, np.full(len(load), load[-1])])
-    how: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "dt": dataset.dt_s,
         "load_unit": dataset.load_unit,
         "thermal": dataset.thermal,
         "cell": dataset.cell,
     }
     errors_s = dict.fromkeys(["eod_error_s", *columns], np.nan)
-    for column, estimate in zip(errors_s, at, strict=True):
+    for column, estimate in zip(errors_s, estimate_rows, strict=True):
         values = {name: getattr(trace, name)[estimate] for name in PARAMETERS}
         is_within = all(PARAMETERS[name].limits[0] <= value <= PARAMETERS[name].limits[1] for name, value in values.items())
         if dataset.starts_full(n) and estimate >= 0 and is_within:
-            errors_s[column] = simulate(load, **values, **how).eod_time_s - record.eod_time_s
+            errors_s[column] = simulate(load, **values, **settings).eod_time_s - record.eod_time_s
     return errors_s
 
 
@@ -190,7 +191,7 @@ def _states_sd(trace: EstimateTrace, name: str) -> bool:
 
 
 def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:
-    """The scores of one parameter over all discharges."""
+    """Return the scores of one parameter over all discharges."""
     true, mape = scores[parameter], scores[f"{parameter}_mape_percent"]
     summary = {
         "mape_percent": mape.mean(),
@@ -204,28 +205,27 @@ def summarize(scores: pd.DataFrame, parameter: str) -> dict[str, float]:
         "bound_percent": (100.0 * scores[f"{parameter}_bound"] / true).mean(),
         "settling_time_1_percent_s": scores[f"{parameter}_settling_time_1_percent_s"].median(),
     }
-    for when in ("", *(f"_at_{percent}_percent" for percent in FORECAST_PERCENT)):
-        summary[f"eod_error_percent{when}"] = (100.0 * scores[f"eod_error{when}_s"].abs() / scores["eod_time_s"]).mean()
+    for suffix in ("", *(f"_at_{percent}_percent" for percent in FORECAST_PERCENT)):
+        summary[f"eod_error_percent{suffix}"] = (100.0 * scores[f"eod_error{suffix}_s"].abs() / scores["eod_time_s"]).mean()
     return {name: float(value) for name, value in summary.items()}
 
 
 def over_seeds(scores: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
-    What several trainings reached: the interquartile mean of their scores, and its 95 % interval by a bootstrap (Agarwal et
-    al. 2021, Deep Reinforcement Learning at the Edge of the Statistical Precipice). Of fewer than four scores the
-    interquartile mean is the mean.
+    Return the interquartile mean of the scores of several trainings, and its 95 % interval by a bootstrap (Agarwal et al.
+    2021, Deep Reinforcement Learning at the Edge of the Statistical Precipice). For fewer than four scores it is the mean.
     """
-    from scipy.stats import bootstrap, trim_mean  # slow to import, and nothing else here needs it
+    from scipy.stats import bootstrap, trim_mean  # here, because the import is slow
 
     def interquartile_mean(sample: FloatArray, axis: int = 0) -> FloatArray:
         return np.asarray(trim_mean(sample, 0.25, axis=axis))
 
-    each = np.asarray(scores, dtype=np.float64)
-    middle = interquartile_mean(each)
-    if len(each) < 2:
-        nothing = np.full_like(middle, np.nan)
-        return middle, nothing, nothing
+    values = np.asarray(scores, dtype=np.float64)
+    mean = interquartile_mean(values)
+    if len(values) < 2:
+        unknown = np.full_like(mean, np.nan)
+        return mean, unknown, unknown
     interval = bootstrap(
-        (each,), interquartile_mean, n_resamples=2000, axis=0, method="percentile", vectorized=True, random_state=0
+        (values,), interquartile_mean, n_resamples=2000, axis=0, method="percentile", vectorized=True, random_state=0
     ).confidence_interval
-    return middle, np.asarray(interval.low), np.asarray(interval.high)
+    return mean, np.asarray(interval.low), np.asarray(interval.high)

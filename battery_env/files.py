@@ -1,4 +1,4 @@
-"""Files that are never there in part."""
+"""Files that are complete or absent."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: What is packed may become so large, or so many times as large as it is.
+#: Largest size of unpacked content, and largest ratio to its packed size.
 LARGEST_UNPACKED_BYTES, MOST_UNPACKED = 1 << 28, 40
 
-# Kinds of files that are no text, or none of numbers, by how they begin, in small letters.
+# Kinds of files that are no table, by their first bytes in small letters.
 _KINDS = {
     "a picture": (b"\x89png", b"\xff\xd8\xff", b"gif8", b"ii*\0", b"mm\0*", b"<svg"),
     "a PDF": (b"%pdf",),
@@ -36,49 +36,49 @@ _KINDS = {
 
 
 def kind_of(content: bytes) -> str:
-    """What a file is, by how it begins; empty if that does not tell."""
+    """Return the kind of a file by its first bytes; empty if unknown."""
     head = content[:64].lstrip().lower()
     return next((kind for kind, heads in _KINDS.items() if head.startswith(heads)), "")
 
 
 class WrongFormatError(ValueError):
-    """A file holds something else than what was asked for."""
+    """A file has another format."""
 
 
 @contextmanager
 def replacing(path: str | os.PathLike[str], new: bool = False) -> Iterator[Path]:
     """
-    A place to write a file to, beside where it is to be. When the block ends the content goes to the disk, and then the file
-    takes its name; what is new takes none that another file has. If anything fails, all is as it was before.
+    Yield a temporary path to write to. At the end of the block the file goes to the disk, and then takes its name; a ``new``
+    file replaces no other. If anything fails, all files stay as they were.
     """
     if new:
         _refuse_if_there(Path(path))
-    # A link stays one, and what it leads to is replaced
+    # a link stays a link; its target is replaced
     target = Path(os.path.realpath(path))
     _make_folder(target.parent)
-    # A name that no process, thread or machine has but this; libraries go by the suffix
-    part = target.with_name(f".{secrets.token_hex(8)}.part{target.suffix}")
+    # a name that no other process, thread or machine uses; libraries need the suffix
+    temporary = target.with_name(f".{secrets.token_hex(8)}.part{target.suffix}")
     try:
-        yield part
-        with part.open("rb+") as stream:
+        yield temporary
+        with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())
-        if target.exists():  # what only its owner may read stays so
-            shutil.copymode(target, part)
+        if target.exists():  # keep its permissions
+            shutil.copymode(target, temporary)
         if new:
-            _take_new_name(part, target)
+            _take_new_name(temporary, target)
         else:
-            os.replace(part, target)
+            os.replace(temporary, target)
         _sync_folder(target.parent)
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
-def _take_new_name(part: Path, target: Path) -> None:
+def _take_new_name(temporary: Path, target: Path) -> None:
     try:
-        os.link(part, target)
-    except OSError:  # it was taken meanwhile; or a file system without links, as of memory sticks
+        os.link(temporary, target)
+    except OSError:  # another process has taken the name, or the file system has no links, as on memory sticks
         _refuse_if_there(target)
-        os.replace(part, target)
+        os.replace(temporary, target)
 
 
 def _refuse_if_there(target: Path) -> None:
@@ -87,14 +87,14 @@ def _refuse_if_there(target: Path) -> None:
 
 
 def _make_folder(folder: Path) -> None:
-    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    for each in missing:
-        _sync_folder(each.parent)
+    for path in missing:
+        _sync_folder(path.parent)
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring the names of files to the disk. Some systems cannot, and the files are whole all the same."""
+    """Write the names of files to the disk; on systems that cannot, the files are complete nevertheless."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -103,16 +103,16 @@ def _sync_folder(folder: Path) -> None:
             os.close(handle)
 
 
-def set_aside(path: Path) -> Path:
-    """Rename what cannot be used, so that nothing is lost and its name is free."""
-    aside = path.with_name(f"{path.name}.{secrets.token_hex(4)}.damaged")
-    os.replace(path, aside)
-    return aside
+def rename_damaged(path: Path) -> Path:
+    """Rename a damaged file, so that nothing is lost and its name is free."""
+    damaged = path.with_name(f"{path.name}.{secrets.token_hex(4)}.damaged")
+    os.replace(path, damaged)
+    return damaged
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold a file, which need not exist, against other commands; the system lets go of it when the process is gone."""
+    """Lock a file, which need not exist, against other commands; the lock ends with the process."""
     from filelock import FileLock, Timeout
 
     _make_folder(path.parent)
@@ -124,16 +124,16 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that results cannot be written to, before they are there to be lost."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    if not there.is_dir():
-        raise FileExistsError(f"{there} is a file: choose another --out")
-    if not os.access(there, os.W_OK):
-        raise PermissionError(f"{there} cannot be written to: choose another --out")
+    """Refuse a folder that is not writable, before results could be lost."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not existing.is_dir():
+        raise FileExistsError(f"{existing} is a file: choose another --out")
+    if not os.access(existing, os.W_OK):
+        raise PermissionError(f"{existing} cannot be written to: choose another --out")
 
 
 def check_new(*paths: Path) -> None:
-    """Refuse to write files where some are, or to a folder that cannot be written to."""
+    """Refuse to replace files, or to write to a folder that is not writable."""
     check_folder(paths[0].parent)
     existing = [str(path) for path in paths if path.exists()]
     if existing:
@@ -141,74 +141,74 @@ def check_new(*paths: Path) -> None:
 
 
 def finite_or_none(value: Any) -> Any:
-    """JSON has no NaN and no infinity."""
+    """Return ``None`` for NaN and infinity, which JSON does not have."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_json(path: str | os.PathLike[str], file_format: str, version: int, content: Mapping[str, Any]) -> Path:
-    """Write a new file in JSON that says what it holds."""
+    """Write a new JSON file with its format and version."""
     target = Path(path)
-    with replacing(target, new=True) as part:
-        described = {"format": file_format, "version": version, **content}
-        part.write_text(json.dumps(described, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    with replacing(target, new=True) as temporary:
+        document = {"format": file_format, "version": version, **content}
+        temporary.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return target
 
 
 def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> dict[str, Any]:
-    """Read what :func:`write_json` wrote."""
+    """Read a file of :func:`write_json`."""
     try:
-        # a whole number of hundreds of digits is none of ours, and no float can hold it
+        # a float cannot hold a whole number of hundreds of digits
         content = json.loads(
             Path(path).read_text(encoding="utf-8"), parse_int=lambda text: int(text) if len(text) < 300 else math.inf
         )
-    except (ValueError, RecursionError) as error:  # of the encoding, of JSON, or of its depth
+    except (ValueError, RecursionError) as error:  # wrong encoding, invalid JSON, or too deep
         raise ValueError(f"{path} is no file in JSON: {error}") from error
-    found = content.pop("format", None) if isinstance(content, dict) else None
-    if found != file_format:
-        raise WrongFormatError(f"{path} holds no {file_format}" + (f" but {found}" if found else ""))
+    stored_format = content.pop("format", None) if isinstance(content, dict) else None
+    if stored_format != file_format:
+        raise WrongFormatError(f"{path} holds no {file_format}" + (f" but {stored_format}" if stored_format else ""))
     if (number := content.pop("version", None)) != version:
         raise ValueError(f"{path} is {file_format} of version {number!r}; this program reads version {version}")
     return dict(content)
 
 
 def npz_path(path: str | os.PathLike[str]) -> Path:
-    """The path with the suffix .npz, which is added if it is missing."""
+    """Return the path with the suffix .npz."""
     target = Path(path)
     return target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
 
 
 def read_npz(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Read arrays and metadata of any format; refuse a damaged file, and one of another kind."""
+    """Read arrays and metadata; refuse a damaged file, or another kind of file."""
     with Path(path).open("rb") as stream:
         size = stream.seek(0, os.SEEK_END)
         stream.seek(0)
         try:
             with np.load(stream, allow_pickle=False) as file:
-                check_unpacked(size, sum(each.file_size for each in file.zip.infolist()))
-                if damaged := file.zip.testzip():
-                    raise ValueError(f"the checksum of {damaged} is wrong")
+                check_unpacked(size, sum(entry.file_size for entry in file.zip.infolist()))
+                if damaged_name := file.zip.testzip():
+                    raise ValueError(f"the checksum of {damaged_name} is wrong")
                 metadata = json.loads(str(file["metadata"]))
                 if metadata["kind"] != kind or "format" not in metadata:
                     raise ValueError(f"it is a {metadata['kind']}")
                 return {name: np.asarray(file[name]) for name in file.files if name != "metadata"}, metadata
-        except Exception as error:  # numpy and zipfile raise whatever the damage leads them to
+        except Exception as error:  # numpy and zipfile raise errors of many types
             raise ValueError(f"{path} is damaged, or no {kind}: {error}") from error
 
 
 def check_unpacked(packed_bytes: int, unpacked_bytes: int) -> None:
-    """Refuse what would become far larger than it is, as no file of measurements does."""
+    """Refuse content that is far larger than its packed size, unlike measurements."""
     if unpacked_bytes > max(LARGEST_UNPACKED_BYTES, MOST_UNPACKED * packed_bytes):
         raise ValueError(f"{packed_bytes} bytes would become more than {unpacked_bytes >> 20} MiB: unpack it by hand")
 
 
-def call_alone(module: str, name: str, *arguments: Any, **options: Any) -> Any:
+def call_in_process(module: str, name: str, *arguments: Any, **options: Any) -> Any:
     """
-    Call a function that damaged files may lead to end its process, in a process of its own.
+    Call a function in a separate process, because a damaged file may end its process.
 
-    :param module: where it is, found as here
-    :param name: what it is called there
-    :param arguments: that have literals, and return what can be pickled, likewise ``options``
-    :raises ValueError: with what the process says last, or how it ended
+    :param module: module of the function
+    :param name: its name
+    :param arguments: its arguments, which need literals; as do ``options``. Its result must be picklable
+    :raises ValueError: with the last line of the process, or its exit status
     """
     code = f"import sys; sys.path[:] = {sys.path!r}\nimport pickle, {module}\n"
     code += f"pickle.dump({module}.{name}(*{arguments!r}, **{options!r}), sys.stdout.buffer)"

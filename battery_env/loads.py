@@ -1,4 +1,4 @@
-"""Loads on a cell: what it delivers, as a function of time."""
+"""Loads of a cell: current or power as a function of time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import LoadUnit, check_load, check_numbers, check_positive, check_range
 from battery_env.records import Record, is_load, load_span, resample_current, switches
 
-_MOST_SEGMENTS = 1e6  # of a random load; beyond, a time is meant in another unit
+_MOST_SEGMENTS = 1e6  # of a random load; more segments mean a time in another unit
 #: The blocks of :class:`BlockBootstrap`, as a share of the record.
 BLOCK_SHARE = 0.1
 
@@ -29,19 +29,16 @@ class KnownLoad(ABC):
     """A load that is known at all times, with its unit, ``"power"`` or ``"current"``."""
 
     unit: LoadUnit
-    #: After this time it never discharges a cell, s; infinite where that is not known.
+    #: After this time the load never discharges a cell, s; infinite if unknown.
     until_s: float = np.inf
 
     @abstractmethod
     def __call__(self, time_s: ArrayLike) -> FloatArray:
-        """The load at some times, W or A."""
+        """Return the load at some times, W or A."""
 
     @abstractmethod
     def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
-        """
-        The mean of the load over steps that start at some times, s: what a simulation in such steps takes to draw what the
-        load does.
-        """
+        """Return the mean of the load over steps that start at some times, s, which keeps its charge or energy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,25 +74,25 @@ class Load(KnownLoad):
         return np.asarray(self.value[np.searchsorted(self.start_s, time, side="right") - 1])
 
     def on_grid(self, time_s: FloatArray) -> FloatArray:
-        """The same for times in ascending order, many times faster: it looks up the segments instead of the times."""
+        """Return the load at ascending times, many times faster than a call, by looking up segments instead of times."""
         bounds = np.append(np.searchsorted(time_s, self.start_s), len(time_s))
         return np.repeat(self.value, np.diff(bounds))
 
     @property
     def until_s(self) -> float:  # type: ignore[override]
-        """After this time it never discharges a cell, s."""
-        drawing = np.flatnonzero(self.value > 0.0)
-        return float(np.append(self.start_s, np.inf)[drawing[-1] + 1 if len(drawing) else 0])
+        """After this time the load never discharges a cell, s."""
+        discharge_rows = np.flatnonzero(self.value > 0.0)
+        return float(np.append(self.start_s, np.inf)[discharge_rows[-1] + 1 if len(discharge_rows) else 0])
 
     @cached_property
     def _totals(self) -> FloatArray:
         return np.append(0.0, np.cumsum(self.value[:-1] * np.diff(self.start_s)))
 
     def drawn(self, time_s: FloatArray) -> FloatArray:
-        """Until some times, charge of a current, C, or energy of a power, J."""
-        # the last value goes on
-        beyond_s = np.maximum(time_s - self.start_s[-1], 0.0)
-        return np.asarray(np.interp(time_s, self.start_s, self._totals) + self.value[-1] * beyond_s)
+        """Return the charge of a current, C, or the energy of a power, J, until some times."""
+        # the last value continues
+        after_end_s = np.maximum(time_s - self.start_s[-1], 0.0)
+        return np.asarray(np.interp(time_s, self.start_s, self._totals) + self.value[-1] * after_end_s)
 
     def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
         return (self.drawn(time_s + dt_s) - self.drawn(time_s)) / dt_s
@@ -124,9 +121,9 @@ class Cycle(KnownLoad):
 
     def __call__(self, time_s: ArrayLike) -> FloatArray:
         time = check_numbers("time_s", time_s)
-        # a time that is a whole number of periods but for rounding belongs to the cycle that starts there
-        within = time - self.period_s * np.floor(time / self.period_s + 1e-9)
-        return self.load(np.where(time < 0.0, time, np.maximum(within, 0.0)))
+        # within rounding, a whole number of periods belongs to the cycle that starts there
+        cycle_s = time - self.period_s * np.floor(time / self.period_s + 1e-9)
+        return self.load(np.where(time < 0.0, time, np.maximum(cycle_s, 0.0)))
 
     def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
         def drawn(until_s: FloatArray) -> FloatArray:
@@ -139,36 +136,34 @@ class Cycle(KnownLoad):
 @dataclass(frozen=True, eq=False)
 class _Spliced(KnownLoad):
     """
-    Blocks of a series of values, one after the other, and the same again after the last. A block that reaches the end of the
-    series goes on at its start. A day of values is not laid out: a forecast holds a thousand of these.
+    Blocks of a series of values, one after the other, repeated after the last block. A block that reaches the end of the
+    series continues at its start. No array holds a day of values, because a forecast has a thousand of these loads.
     """
 
     value: FloatArray  # one for each ``dt_s``
-    start: IntArray  # where in the series each block starts
+    start: IntArray  # start of each block in the series
     length: int  # of a block, in values
     dt_s: float
     unit: LoadUnit
 
     def __call__(self, time_s: ArrayLike) -> FloatArray:
-        block, within = np.divmod((np.asarray(time_s) / self.dt_s + 1e-9).astype(np.int64), self.length)
-        return np.asarray(self.value[(self.start[block % len(self.start)] + within) % len(self.value)])
+        block, offset = np.divmod((np.asarray(time_s) / self.dt_s + 1e-9).astype(np.int64), self.length)
+        return np.asarray(self.value[(self.start[block % len(self.start)] + offset) % len(self.value)])
 
     def mean(self, time_s: FloatArray, dt_s: float) -> FloatArray:
-        # no more of the values than the steps are in
+        # only the values within the steps
         start, length = time_s / self.dt_s, dt_s / self.dt_s
-        places = np.arange(int(start.min()), int(np.ceil(start.max() + length)) + 1, dtype=np.float64)
-        totals = np.append(0.0, np.cumsum(self(self.dt_s * places[:-1])))
-        return (np.interp(start + length, places, totals) - np.interp(start, places, totals)) / length
+        edges = np.arange(int(start.min()), int(np.ceil(start.max() + length)) + 1, dtype=np.float64)
+        totals = np.append(0.0, np.cumsum(self(self.dt_s * edges[:-1])))
+        return (np.interp(start + length, edges, totals) - np.interp(start, edges, totals)) / length
 
 
-#: Draws a load at random: what :meth:`battery_env.trajectories.TrajectoryDataset.generate` takes for random loads.
+#: A function that draws a load, for :meth:`battery_env.trajectories.TrajectoryDataset.generate`.
 LoadSampler = Callable[[np.random.Generator], Load]
 
 
 class RandomLoad(ABC):
-    """
-    A load with a known distribution: :func:`battery_env.forecast` draws a load for each sample.
-    """
+    """A load with a known distribution: :func:`battery_env.forecast` draws a load for each sample."""
 
     @abstractmethod
     def __call__(self, rng: np.random.Generator) -> KnownLoad:
@@ -177,7 +172,7 @@ class RandomLoad(ABC):
 
 @dataclass(frozen=True, eq=False)
 class _Function(KnownLoad):
-    """A function of time as a load: over each step its value at the start."""
+    """A function of time as a load: its value at the start of a step holds over the step."""
 
     function: Callable[[FloatArray], ArrayLike]
     unit: LoadUnit
@@ -193,14 +188,14 @@ class _Function(KnownLoad):
         return self(time_s)
 
 
-#: What a load to come can be given as.
+#: A future load, as an argument.
 LoadToCome = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
 
 
 def known_load(load: Any, unit: LoadUnit) -> KnownLoad:
     """
-    A load from what is given of it: a load of this module, or a number or a function of time in s that takes an array, of some
-    unit.
+    Convert an argument to a load: a load of this module, a number, or a function of time in s that takes an array; ``unit`` is
+    that of a number or a function.
     """
     if isinstance(load, KnownLoad):
         return load
@@ -216,7 +211,7 @@ def known_load(load: Any, unit: LoadUnit) -> KnownLoad:
 
 
 def constant(value: float, unit: LoadUnit = "power") -> Load:
-    """The same load at all times, power in W or current in A."""
+    """Return a constant load, power in W or current in A."""
     return Load(np.zeros(1), check_numbers("value", [value]), unit)
 
 
@@ -289,27 +284,27 @@ class RandomWalk(RandomLoad):
         width = high - low
         segments = int(np.ceil(self.total_s / self.segment_s))
         steps = rng.uniform(-self.largest_step, self.largest_step, size=segments - 1)
-        free = np.cumsum(np.concatenate([[rng.uniform(0.0, width)], steps]))
+        free_walk = np.cumsum(np.concatenate([[rng.uniform(0.0, width)], steps]))
         # a walk between two mirrors is a free walk, folded
-        folded = width - np.abs(free % (2.0 * width) - width)
-        return Load(self.segment_s * np.arange(segments, dtype=np.float64), low + folded, self.unit)
+        walk = width - np.abs(free_walk % (2.0 * width) - width)
+        return Load(self.segment_s * np.arange(segments, dtype=np.float64), low + walk, self.unit)
 
 
 def steadier_unit(record: Record) -> LoadUnit:
     """
-    The unit that a consumer holds: that of current and power which drifts less between the switches of the load while the
-    voltage falls.
+    Return the unit that the consumer controls: current or power, whichever drifts less between switches while the voltage
+    falls.
     """
     current_A = np.asarray(record.current_A)
-    parts, loaded = np.split(np.arange(len(current_A)), switches(current_A) + 1), is_load(current_A)
+    stretches, is_loaded = np.split(np.arange(len(current_A)), switches(current_A) + 1), is_load(current_A)
     drift = {"current": 0.0, "power": 0.0}
-    for part in parts:
-        # the first sample after a switch may show a part of it only
-        third = (len(part) - 1) // 3
-        if third < 1 or not loaded[part].all():
+    for stretch in stretches:
+        # the first sample after a switch may mix both sides
+        third = (len(stretch) - 1) // 3
+        if third < 1 or not is_loaded[stretch].all():
             continue
         for unit, load in (("current", current_A), ("power", current_A * np.asarray(record.voltage_V))):
-            drift[unit] += float(np.log(load[part[-third:]].mean() / load[part[1 : 1 + third]].mean()) ** 2)
+            drift[unit] += float(np.log(load[stretch[-third:]].mean() / load[stretch[1 : 1 + third]].mean()) ** 2)
     return "power" if drift["power"] < drift["current"] else "current"
 
 
@@ -365,6 +360,6 @@ class BlockBootstrap(RandomLoad):
     def __call__(self, rng: np.random.Generator) -> KnownLoad:
         """Draw one load."""
         count = len(self._values)
-        seen = rng.integers(count, size=-(-count // self._length))
+        sources = rng.integers(count, size=-(-count // self._length))
         blocks = int(np.ceil(self.total_s / (self._length * self.dt_s)))
-        return _Spliced(self._values, rng.choice(seen, size=blocks), self._length, self.dt_s, self.unit)
+        return _Spliced(self._values, rng.choice(sources, size=blocks), self._length, self.dt_s, self.unit)

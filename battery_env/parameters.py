@@ -1,4 +1,4 @@
-"""What can be calibrated: the two parameters of the model that age."""
+"""The two parameters of the model that age, and that calibrators estimate."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from battery_env.checks import check_within
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the model that can be calibrated."""
+    """A parameter of the model."""
 
     name: str  # in code and in tables
     symbol: str  # as TeX
     unit: str  # in code and in messages
-    limits: tuple[float, float]  # least and largest value; they catch mistakes in the unit, and nonsense
-    hint: str  # what a value beyond them usually is, a sentence
+    limits: tuple[float, float]  # least and largest value, to catch wrong units
+    hint: str  # a sentence on the usual cause of a value beyond the limits
 
     @property
     def label(self) -> str:
@@ -44,13 +44,13 @@ _UNIT_SYMBOLS = {"C": "C", "ohm": r"$\Omega$"}
 Q_MOBILE = Parameter("q_mobile", "$q_{max}$", "C", (100.0, 1e7), "Ampere-hours become coulombs times 3600.")
 R_O = Parameter("r_o", "$R_o$", "ohm", (0.0, 50.0), "Milliohms become ohms divided by 1000.")
 
-#: What can be calibrated, by name.
+#: The parameters by name.
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType({parameter.name: parameter for parameter in (Q_MOBILE, R_O)})
 PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETERS)
 
 
 def check_parameters(parameters: Sequence[str]) -> tuple[str, ...]:
-    """Refuse a choice of parameters that cannot be searched for."""
+    """Refuse an invalid choice of parameters."""
     names = tuple(parameters)
     if not names or len(set(names)) < len(names) or set(names) - set(PARAMETERS):
         raise ValueError(f"parameters must be one or both of {PARAMETER_NAMES}, got {parameters!r}")

@@ -1,4 +1,4 @@
-"""Errors of voltage and current sensors: the one simulator of them, for training and evaluation alike."""
+"""Errors of voltage and current sensors, for training and evaluation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from battery_env.electrochemistry import FloatArray, Trajectory
 @dataclass(frozen=True)
 class SensorErrors:
     """
-    Errors of the sensors in a simulated discharge. A calibrator sees their readings alone; state and load remain as they are.
+    Errors of the sensors in a simulated discharge. A calibrator gets only their readings; state and load stay as they are.
 
     :param noise_V: standard deviation of white normal noise on the voltage, V
     :param offset_V: constant error of the voltage, V
@@ -38,11 +38,11 @@ class SensorErrors:
             raise ValueError(f"current_gain must be greater than 0 (1: exact), got {self.current_gain!r}")
 
     def draw(self, rng: np.random.Generator) -> SensorErrors:
-        """The errors of one discharge: these, whatever ``rng``."""
+        """Return these errors, for any ``rng``."""
         return self
 
     def read_voltage_V(self, voltage_V: FloatArray, noise: FloatArray) -> FloatArray:
-        """The voltage as it is read, where ``noise`` is standard normal; any shape."""
+        """Return the reading of a voltage; ``noise`` is standard normal, any shape."""
         return voltage_V + self.noise_V * noise + self.offset_V
 
     def apply(self, trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
@@ -59,8 +59,8 @@ class RandomSensorErrors:
 
     :param noise_V: least and greatest standard deviation of the noise, drawn log-uniformly, V; (0, 0): none
     :param offset_V: the offset of the voltage is drawn uniformly within this to either side, V
-    :param current_gain: likewise the relative error of the current's gain
-    :param current_offset_A: likewise the offset of the current, A
+    :param current_gain: limit of the relative error of the current's gain, also uniform
+    :param current_offset_A: limit of the offset of the current, also uniform, A
     :raises ValueError: for values that are negative, too large for a sensor, or in the wrong order
     """
 
@@ -84,7 +84,7 @@ class RandomSensorErrors:
         return self.draw_biases(rng, self.draw_noise_V(rng))
 
     def draw_noise_V(self, rng: np.random.Generator) -> float:
-        """Draw the standard deviation of the noise of one discharge, V; nothing is drawn where there is no noise."""
+        """Draw the standard deviation of the noise of one discharge, V; without noise use no random number."""
         return float(np.exp(rng.uniform(*self._log_noise))) if self.noise_V[1] > 0.0 else 0.0
 
     @cached_property
@@ -93,7 +93,7 @@ class RandomSensorErrors:
         return least, greatest
 
     def draw_biases(self, rng: np.random.Generator, noise_V: float) -> SensorErrors:
-        """Draw the errors of one discharge whose noise is known, V; nothing is drawn where a bound is 0."""
+        """Draw the errors of one discharge with this noise, V; a bound of 0 uses no random number."""
         offset_V, gain, offset_A = (
             rng.uniform(-bound, bound) if bound > 0.0 else 0.0
             for bound in (self.offset_V, self.current_gain, self.current_offset_A)

@@ -44,13 +44,13 @@ PAPER_TRIM = (0.05, 0.95)
 #: Largest ``mismatch`` of :meth:`TrajectoryDataset.generate`: beyond, the constants would be another cell's.
 MISMATCH_LIMIT = 0.5
 
-_CHECKPOINT_EVERY = 64  # steps between stored states: a window starts with 32 steps of re-simulation on average
+_CHECKPOINT_EVERY = 64  # steps between stored states: access to a state simulates 32 steps on average
 _MIN_SAMPLES = 8
-_LEFT_SAMPLES = 4  # of a discharge that is trimmed
+_MIN_TRIMMED_SAMPLES = 4
 _LEAST_DT_S = 0.01  # of a discharge that may take a day
 _INDICES = ("load_start", "samples", "first", "stop", "checkpoint_start")
-_PER_TRAJECTORY = ("q_mobile", "r_o", "factors", "equilibrium_V", "eod_time_s", *_INDICES)
-_ARRAYS = (*_PER_TRAJECTORY, "load_values", "checkpoint")
+_TRAJECTORY_ARRAYS = ("q_mobile", "r_o", "factors", "equilibrium_V", "eod_time_s", *_INDICES)
+_ARRAYS = (*_TRAJECTORY_ARRAYS, "load_values", "checkpoint")
 _SETTINGS = ("load_unit", "dt_s", "thermal")
 _KIND, _FORMAT = "data set of simulated discharges", 4
 
@@ -58,7 +58,7 @@ _KIND, _FORMAT = "data set of simulated discharges", 4
 @dataclass(frozen=True, eq=False)
 class TrajectoryDataset(Sequence[Trajectory]):
     """
-    Simulated discharges of many cells, to train and to test on.
+    Simulated discharges of many cells, for training and tests.
 
     .. code-block:: python
 
@@ -83,13 +83,13 @@ class TrajectoryDataset(Sequence[Trajectory]):
     :param equilibrium_V: additions to the equilibrium voltage of each true cell, as in an
         :class:`~battery_env.AgingPath`, V, shape (n, 8); zeros if the voltage of ``cell`` is exact
     :param eod_time_s: end of discharge, s after the first sample of the whole discharge, shape (n,); NaN where unknown
-    :param load_values: all load profiles end to end, one value a step
-    :param load_start: where in ``load_values`` each trajectory's profile starts, shape (n,); trajectories may share a profile
+    :param load_values: all load profiles, concatenated, one value a step
+    :param load_start: start of each trajectory's profile in ``load_values``, shape (n,); trajectories may share a profile
     :param samples: length of the whole discharge, shape (n,)
     :param first: first sample that counts as data, shape (n,)
-    :param stop: one past the last sample that does, shape (n,)
-    :param checkpoint: states after 0, 64, 128, ... steps, all trajectories end to end, shape (m, 8)
-    :param checkpoint_start: where in ``checkpoint`` each trajectory starts, shape (n,)
+    :param stop: the last sample that counts as data, plus one, shape (n,)
+    :param checkpoint: states after 0, 64, 128, ... steps, of all trajectories, concatenated, shape (m, 8)
+    :param checkpoint_start: start of each trajectory in ``checkpoint``, shape (n,)
     :param load_unit: ``"power"`` or ``"current"``
     :param dt_s: time step, s
     :param thermal: whether the temperature moves
@@ -127,9 +127,9 @@ class TrajectoryDataset(Sequence[Trajectory]):
         mismatch: float = 0.0,
     ) -> TrajectoryDataset:
         """
-        Discharges of ``n`` cells whose age is drawn uniformly; the parameter that does not age is the cell's.
+        Simulate discharges of ``n`` cells with uniformly drawn ages; a parameter that does not age is the cell's.
 
-        :param parameters: what ages, independently: ``"q_mobile"``, ``"r_o"``, or both, ``("q_mobile", "r_o")``
+        :param parameters: the parameters that age, independently: ``"q_mobile"``, ``"r_o"``, or ``("q_mobile", "r_o")``
         :param n: number of discharges
         :param loads: loads to choose from at random, or a sampler of loads
         :param seed: seed of ages and loads
@@ -137,12 +137,12 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :param r_o_range: ohm
         :param dt_s: time step, s
         :param thermal: whether the temperature moves
-        :param cell: constants of the cell, as a calibrator may know them, and what does not age; ``None``: the new cell's
-        :param mismatch: how wrong they are: relative standard deviation of the factors, log-normal with median 1, that each
-            of ``UNCERTAIN_CONSTANTS`` of each cell is multiplied by, at most 0.5. Ages and loads do not depend on it
+        :param cell: constants of the cell, as a calibrator may know them; ``None``: the new cell's
+        :param mismatch: error of these constants: relative standard deviation of the factors of ``UNCERTAIN_CONSTANTS`` of
+            each cell, log-normal with median 1, at most 0.5. Ages and loads do not depend on it
         :raises ValueError: for values out of range
         """
-        aged = aged_parameters(parameters)
+        names = aged_parameters(parameters)
         n, seed = check_whole_number("n", n), check_whole_number("seed", seed)
         if n < 1 or seed < 0:
             raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
@@ -153,12 +153,12 @@ class TrajectoryDataset(Sequence[Trajectory]):
         R_O.check(r_range)
         cell = check_cell(cell, thermal)
         rng = np.random.default_rng(seed)
-        q = rng.uniform(*q_range, size=n) if "q_mobile" in aged else np.full(n, cell.q_mobile)
-        r = rng.uniform(*r_range, size=n) if "r_o" in aged else np.full(n, cell.r_o)
-        drawn, index = _drawn_loads(loads, n, rng)
-        # drawn last, so that all else is the same with and without a mismatch
+        q = rng.uniform(*q_range, size=n) if "q_mobile" in names else np.full(n, cell.q_mobile)
+        r = rng.uniform(*r_range, size=n) if "r_o" in names else np.full(n, cell.r_o)
+        cell_loads, index = _draw_loads(loads, n, rng)
+        # drawn last, so that ages and loads do not depend on the mismatch
         factors = np.exp(np.sqrt(np.log1p(mismatch**2)) * rng.standard_normal((n, len(UNCERTAIN_CONSTANTS))))
-        return TrajectoryDataset.simulated(q, r, drawn, index, dt_s, thermal, cell, factors)
+        return TrajectoryDataset.simulated(q, r, cell_loads, index, dt_s, thermal, cell, factors)
 
     @staticmethod
     def along(
@@ -169,9 +169,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         dt_s: float = 1.0,
     ) -> TrajectoryDataset:
         """
-        Discharges of ``n`` cells drawn along a path, whose constants age together with ``q_mobile`` and ``r_o``; loads, seed
-        and simulation as of :meth:`generate`. The ``cell`` of the data set has the constants that all ages share, as a
-        calibrator may know them.
+        Simulate discharges of ``n`` cells drawn along a path, whose constants age together with ``q_mobile`` and ``r_o``;
+        loads, seed and simulation as of :meth:`generate`. The ``cell`` of the data set has the constants that all ages share.
 
         .. code-block:: python
 
@@ -183,11 +182,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
         if not isinstance(path, AgingPath):
             raise TypeError(f"path must be an AgingPath, got {type(path).__name__}")
         cells = path.draw(n, seed)
-        drawn, index = _drawn_loads(loads, n, np.random.default_rng([seed, 1]))
+        cell_loads, index = _draw_loads(loads, n, np.random.default_rng([seed, 1]))
         return TrajectoryDataset.simulated(
             cells.q_mobile,
             cells.r_o,
-            drawn,
+            cell_loads,
             index,
             dt_s,
             cell=path.cell,
@@ -226,20 +225,18 @@ class TrajectoryDataset(Sequence[Trajectory]):
         if units not in ({"power"}, {"current"}):
             raise ValueError(f"loads must be Loads, all in one unit (power or current), got {sorted(units)}")
         index = np.broadcast_to(check_indices("load_index", load_index, len(loads)), q.shape)
-        known = np.ones(1) if factors is None else np.asarray(factors, dtype=np.float64)
-        multiples = np.broadcast_to(known, (q.size, len(UNCERTAIN_CONSTANTS))).copy()
-        added_V = np.broadcast_to(
-            0.0 if equilibrium_V is None else np.asarray(equilibrium_V), (q.size, EQUILIBRIUM_SIZE)
-        ).copy()
+        factors = np.broadcast_to(1.0 if factors is None else factors, (q.size, len(UNCERTAIN_CONSTANTS)))
+        added_V = np.broadcast_to(0.0 if equilibrium_V is None else equilibrium_V, (q.size, EQUILIBRIUM_SIZE))
+        factors, added_V = np.array(factors, dtype=np.float64, order="C"), np.array(added_V, dtype=np.float64, order="C")
         cell = check_cell(cell, thermal)
-        dt_s = _check_dt(dt_s, cell, multiples)
+        dt_s = _check_dt(dt_s, cell, factors)
         if dt_s < _LEAST_DT_S:
             raise ValueError(f"dt_s must be at least {_LEAST_DT_S:g} s (a day of it must fit in memory), got {dt_s!r}")
-        profiles, samples, checkpoints = _discharged(q, r, loads, index, dt_s, thermal, cell, multiples, added_V)
+        profiles, samples, checkpoints = _simulate(q, r, loads, index, dt_s, thermal, cell, factors, added_V)
         return TrajectoryDataset(
             q_mobile=np.array(q),
             r_o=np.array(r),
-            factors=multiples,
+            factors=factors,
             equilibrium_V=added_V,
             eod_time_s=np.asarray(samples * dt_s, dtype=np.float64),
             load_values=np.concatenate(profiles),
@@ -257,27 +254,27 @@ class TrajectoryDataset(Sequence[Trajectory]):
 
     def trimmed(self, low: float, high: float) -> TrajectoryDataset:
         """
-        The same of which only a part of each discharge counts as data, from one share of its length to another one; of short
-        discharges four samples are left, whatever is trimmed.
+        Return the data set with only a part of each discharge as data, from one share of its length to another; short
+        discharges keep at least four samples.
 
         :raises ValueError: unless 0 <= low < high <= 1
         """
         if not 0.0 <= low < high <= 1.0:
             raise ValueError(f"low and high must be two increasing shares within 0 .. 1, got {low!r} and {high!r}")
-        first = np.minimum(np.ceil(low * self.samples).astype(np.int64), self.samples - _LEFT_SAMPLES)
-        stop = np.maximum(np.floor(high * self.samples).astype(np.int64), first + _LEFT_SAMPLES)
+        first = np.minimum(np.ceil(low * self.samples).astype(np.int64), self.samples - _MIN_TRIMMED_SAMPLES)
+        stop = np.maximum(np.floor(high * self.samples).astype(np.int64), first + _MIN_TRIMMED_SAMPLES)
         return replace(self, first=first, stop=stop)
 
     @classmethod
     def from_trajectories(cls, trajectories: Sequence[Trajectory]) -> TrajectoryDataset:
         """
-        A data set of trajectories made one by one with :func:`~battery_env.electrochemistry.simulate`.
+        Make a data set of single trajectories of :func:`~battery_env.electrochemistry.simulate`.
 
-        :param trajectories: simulated discharges or parts of them, of cells that differ in ``q_mobile`` and ``r_o`` alone, in
+        :param trajectories: simulated discharges or parts of them, of cells that differ only in ``q_mobile`` and ``r_o``, with
             one unit of load and one time step
-        :return: the data set; its clock starts with each trajectory, and its constants are exactly theirs. To keep a
-            ``mismatch`` take a :meth:`subset` instead
-        :raises ValueError: if there are none, or they differ in more than that
+        :return: the data set, with a clock that starts with each trajectory, and with exact constants. To keep a ``mismatch``
+            use a :meth:`subset` instead
+        :raises ValueError: for no trajectories, or trajectories that differ otherwise
         """
         if isinstance(trajectories, Trajectory):
             raise TypeError("trajectories must be a list of them, got one Trajectory")
@@ -287,13 +284,13 @@ class TrajectoryDataset(Sequence[Trajectory]):
             if len(trajectory.time_s) == 0:
                 raise ValueError("trajectories must hold at least one sample each, got an empty one")
         cells = {trajectory.cell.replace(q_mobile=NEW_CELL.q_mobile, r_o=NEW_CELL.r_o) for trajectory in trajectories}
-        ways = {(trajectory.load_unit, trajectory.dt_s, trajectory.thermal) for trajectory in trajectories}
-        if len(cells) != 1 or len(ways) != 1:
+        settings = {(trajectory.load_unit, trajectory.dt_s, trajectory.thermal) for trajectory in trajectories}
+        if len(cells) != 1 or len(settings) != 1:
             raise ValueError(
                 "trajectories must share the constants of the cell but for q_mobile and r_o, one load unit, one time step (s) "
-                f"and whether they are thermal, got {len(cells)} sets of constants and {ways}"
+                f"and whether they are thermal, got {len(cells)} sets of constants and {settings}"
             )
-        load_unit, dt_s, thermal = ways.pop()
+        load_unit, dt_s, thermal = settings.pop()
         samples = np.array([len(trajectory.time_s) for trajectory in trajectories], dtype=np.int64)
         checkpoints = [trajectory.state[::_CHECKPOINT_EVERY] for trajectory in trajectories]
         return cls(
@@ -318,11 +315,11 @@ class TrajectoryDataset(Sequence[Trajectory]):
     @classmethod
     def paper(cls, parameter: str) -> TrajectoryDataset:
         """
-        The data of Unagar et al. 2020 (their code): eleven constant loads of 8 to 16 W times 501 values of the parameter
-        (q_mobile 4000 to 7000 C, or r_o 0.1 to 0.2 ohm), from full charge to 3 V, trimmed to 5 .. 95 %. Made once per
-        process, in seconds.
+        Return the data of Unagar et al. 2020 (their code): eleven constant loads of 8 to 16 W times 501 values of the
+        parameter (q_mobile 4000 to 7000 C, or r_o 0.1 to 0.2 ohm), from full charge to 3 V, trimmed to 5 .. 95 %. A process
+        makes them once, in seconds.
 
-        :param parameter: what ages
+        :param parameter: the parameter that ages
         :return: the data set of 5511 trajectories
         """
         if parameter not in PAPER_RANGES:
@@ -346,7 +343,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         state, columns = np.empty((samples + 1, STATE_SIZE)), np.empty((2, samples))
         voltage, current = columns
         state[0] = self.checkpoint[self.checkpoint_start[n]]
-        # no cut-off: a data set of recorded trajectories may hold samples below it
+        # no cut-off, because trajectories of a user may have samples below it
         q, r, is_power, packed = self.q_mobile[n], self.r_o[n], self.load_unit == "power", self.packed(np.array([n]))
         if roll_out(load, q, r, self.dt_s, -np.inf, is_power, self.thermal, packed, state, columns) < samples:
             raise ValueError(f"trajectory {n} cannot be simulated again: it was made with another load or other constants")
@@ -364,29 +361,26 @@ class TrajectoryDataset(Sequence[Trajectory]):
         ).part(self.first[n], self.stop[n])
 
     def load_profile(self, n: int) -> FloatArray:
-        """The load of a whole discharge, before it was trimmed: one value a step, W or A."""
+        """Return the load of an untrimmed discharge: one value a step, W or A."""
         return self.load_values[self.load_start[n] : self.load_start[n] + self.samples[n]]
 
     def starts_full(self, n: int) -> bool:
-        """Whether a whole discharge, before it was trimmed, starts with a fully charged cell at rest."""
+        """Whether an untrimmed discharge starts with a fully charged cell at rest."""
         return np.array_equal(self.checkpoint[self.checkpoint_start[n]], initial_state(self.q_mobile[n], self.cell))
 
     def _cell(self, n: int) -> CellParameters:
-        """The true constants of a trajectory."""
-        known = {name: getattr(self.cell, name) for name in UNCERTAIN_CONSTANTS}
-        true = {name: factor * known[name] for name, factor in zip(known, self.factors[n].tolist(), strict=True)}
+        """Return the true constants of a trajectory."""
+        nominal = {name: getattr(self.cell, name) for name in UNCERTAIN_CONSTANTS}
+        true = {name: factor * nominal[name] for name, factor in zip(nominal, self.factors[n].tolist(), strict=True)}
         cell = self.cell.replace(q_mobile=float(self.q_mobile[n]), r_o=float(self.r_o[n]), **true)
         return with_equilibrium(cell, self.equilibrium_V[n]) if self.equilibrium_V[n].any() else cell
 
     def packed(self, index: IntArray) -> PackedConstants:
-        """
-        The true constants of some trajectories of one equilibrium voltage, one row a cell; or one row, where all have those of
-        ``cell``.
-        """
+        """Return the true constants of trajectories of one equilibrium voltage: one row a cell, or one row of ``cell``."""
         return _packed(self.cell, self.factors[index], self.equilibrium_V[index])
 
     def states_at(self, index: IntArray, sample: IntArray) -> FloatArray:
-        """True states of some trajectories at some of their samples, counted from full charge: shape (m, 8)."""
+        """Return the true states of trajectories at samples, counted from full charge: shape (m, 8)."""
         if len(index) > 1 and self.equilibrium_V.any():
             return np.concatenate([self.states_at(index[[k]], sample[[k]]) for k in range(len(index))])
         block, steps = np.divmod(sample, _CHECKPOINT_EVERY)
@@ -406,24 +400,22 @@ class TrajectoryDataset(Sequence[Trajectory]):
         return state
 
     def subset(self, index: ArrayLike) -> TrajectoryDataset:
-        """
-        A data set of some of the trajectories, by their numbers and in their order, which shares the loads with this one.
-        """
-        chosen = check_indices("index", index, len(self))
-        if chosen.ndim != 1 or chosen.size == 0:
-            raise ValueError(f"index must be 1-D and not empty, got shape {chosen.shape}")
-        counts = _checkpoints(self.samples[chosen])
+        """Return a data set of trajectories by number, in this order; it shares the loads of this data set."""
+        rows = check_indices("index", index, len(self))
+        if rows.ndim != 1 or rows.size == 0:
+            raise ValueError(f"index must be 1-D and not empty, got shape {rows.shape}")
+        counts = _checkpoints(self.samples[rows])
         starts = _starts(counts)
-        rows = np.arange(counts.sum()) + np.repeat(self.checkpoint_start[chosen] - starts, counts)
-        changes = {name: getattr(self, name)[chosen] for name in _PER_TRAJECTORY}
-        changes.update(checkpoint=self.checkpoint[rows], checkpoint_start=starts)
+        checkpoint_rows = np.arange(counts.sum()) + np.repeat(self.checkpoint_start[rows] - starts, counts)
+        changes = {name: getattr(self, name)[rows] for name in _TRAJECTORY_ARRAYS}
+        changes.update(checkpoint=self.checkpoint[checkpoint_rows], checkpoint_start=starts)
         return replace(self, **changes)
 
     def split(
         self, test: float = 0.3, by: Literal["trajectory", "parameter"] = "trajectory", seed: int = 0
     ) -> tuple[TrajectoryDataset, TrajectoryDataset]:
         """
-        Divide into trajectories to train on and trajectories to test on.
+        Divide into training trajectories and test trajectories.
 
         :param test: share of the test part, greater than 0 and less than 1
         :param by: ``"trajectory"``: at random; ``"parameter"``: the most aged cells (lowest q_mobile, or highest r_o where
@@ -446,20 +438,20 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         Save as an npz file (no pickle) that holds the arrays and, as JSON, the constants.
 
-        :param path: where to; ``.npz`` is added if it is missing
+        :param path: the file; a missing suffix ``.npz`` is added
         :raises FileExistsError: if the file exists already
         """
         settings = {name: getattr(self, name) for name in _SETTINGS} | {"cell": asdict(self.cell)}
         target, metadata = npz_path(path), json.dumps({**settings, "kind": _KIND, "format": _FORMAT})
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
-        with replacing(target, new=True) as part:
-            np.savez_compressed(part, metadata=np.array(metadata), **arrays)
+        with replacing(target, new=True) as temporary:
+            np.savez_compressed(temporary, metadata=np.array(metadata), **arrays)
         return target
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TrajectoryDataset:
         """
-        Read what :meth:`save` wrote.
+        Read a file of :meth:`save`.
 
         :param path: the npz file
         :raises ValueError: if the file is damaged, no such data set, or of another format version
@@ -488,8 +480,8 @@ def _packed(cell: CellParameters, factors: FloatArray, equilibrium_V: FloatArray
     return cell.packed if (factors == 1.0).all() else cell.packed_with(factors)
 
 
-def _drawn_loads(loads: Sequence[Load] | LoadSampler, n: int, rng: np.random.Generator) -> tuple[list[Load], IntArray]:
-    """Loads, and which of them each of n cells gets."""
+def _draw_loads(loads: Sequence[Load] | LoadSampler, n: int, rng: np.random.Generator) -> tuple[list[Load], IntArray]:
+    """Return the loads, and the index of the load of each of n cells."""
     if isinstance(loads, Load) or not (callable(loads) or isinstance(loads, Sequence)):
         raise TypeError(f"loads must be a list of Loads or a sampler of them, got {type(loads).__name__}")
     if callable(loads):
@@ -500,11 +492,11 @@ def _drawn_loads(loads: Sequence[Load] | LoadSampler, n: int, rng: np.random.Gen
 
 
 def aged_parameters(parameters: str | Sequence[str]) -> tuple[str, ...]:
-    """The parameters that age, of which one may be given by its name alone, in the order of ``PARAMETER_NAMES``."""
+    """Return the parameters that age, from one name or several, in the order of ``PARAMETER_NAMES``."""
     return tuple(sorted(check_parameters([parameters] if isinstance(parameters, str) else parameters)))
 
 
-def _discharged(
+def _simulate(
     q_mobile: FloatArray,
     r_o: FloatArray,
     loads: Sequence[Load],
@@ -515,13 +507,13 @@ def _discharged(
     factors: FloatArray,
     equilibrium_V: FloatArray,
 ) -> tuple[list[FloatArray], IntArray, list[FloatArray]]:
-    """The profile of each load as far as it is needed; of each cell the number of samples, and the states to keep."""
+    """Return the profile of each load up to its last sample, and for each cell the number of samples and its checkpoints."""
     is_power = loads[0].unit == "power"
     day = dt_s * np.arange(round(86_400 / dt_s), dtype=np.float64)
     start = initial_state(q_mobile, cell)
     samples = np.empty(q_mobile.size, dtype=np.int64)
     profiles, checkpoints = [], {}
-    # one place to simulate in, for all cells in turn
+    # one buffer for all cells
     state, columns = np.empty((len(day) + 1, STATE_SIZE)), np.empty((2, len(day)))
     for k, load in enumerate(loads):
         profile = load.on_grid(day)
@@ -543,9 +535,9 @@ def _discharged(
 
 
 def _check(data: TrajectoryDataset) -> None:
-    """Refuse arrays of a file that do not fit together: compiled loops go by their indices."""
+    """Refuse inconsistent arrays of a file, because compiled loops do not check indices."""
     n = np.size(data.q_mobile)
-    shapes = dict.fromkeys(_PER_TRAJECTORY, (n,)) | {
+    shapes = dict.fromkeys(_TRAJECTORY_ARRAYS, (n,)) | {
         "factors": (n, len(UNCERTAIN_CONSTANTS)),
         "equilibrium_V": (n, EQUILIBRIUM_SIZE),
         "load_values": (np.size(data.load_values),),
@@ -557,19 +549,19 @@ def _check(data: TrajectoryDataset) -> None:
             raise ValueError(
                 f"{name} must be an array of {dtype.__name__} of shape {shape}, not empty, got {array.dtype} {array.shape}"
             )
-    fits = {
+    is_valid = {
         "first and stop": (data.first >= 0) & (data.first < data.stop) & (data.stop <= data.samples),
         "load_start": (data.load_start >= 0) & (data.load_start + data.samples <= len(data.load_values)),
         "checkpoint_start": (data.checkpoint_start >= 0)
         & (data.checkpoint_start + _checkpoints(data.samples) <= len(data.checkpoint)),
     }
-    for name, each in fits.items():
-        if not each.all():
-            raise ValueError(f"{name} of trajectory {np.flatnonzero(~each)[0]} lie outside its data")
+    for name, is_inside in is_valid.items():
+        if not is_inside.all():
+            raise ValueError(f"{name} of trajectory {np.flatnonzero(~is_inside)[0]} lie outside its data")
 
 
 def _check_dt(dt_s: float, cell: CellParameters, factors: FloatArray) -> float:
-    # explicit Euler must be stable for the cell whose constants are fastest
+    # explicit Euler must be stable for the cell with the fastest constants
     fastest = dict(zip(UNCERTAIN_CONSTANTS, factors.min(axis=0), strict=True))
     return check_dt(dt_s, cell.replace(to=cell.to * fastest["to"], tsn=cell.tsn * fastest["tsn"]))
 
@@ -582,10 +574,10 @@ def _starts(lengths: IntArray) -> IntArray:
 def _paper(parameter: str) -> TrajectoryDataset:
     value = np.tile(np.linspace(*PAPER_RANGES[parameter], PAPER_VALUES), len(PAPER_LOADS_W))
     fixed = np.full_like(value, NEW_CELL.r_o if parameter == "q_mobile" else NEW_CELL.q_mobile)
-    whole = TrajectoryDataset.simulated(
+    dataset = TrajectoryDataset.simulated(
         q_mobile=value if parameter == "q_mobile" else fixed,
         r_o=fixed if parameter == "q_mobile" else value,
         loads=[constant(power) for power in PAPER_LOADS_W],
         load_index=np.repeat(np.arange(len(PAPER_LOADS_W)), PAPER_VALUES),
     )
-    return whole.trimmed(*PAPER_TRIM)
+    return dataset.trimmed(*PAPER_TRIM)

@@ -32,7 +32,7 @@ from tqdm import tqdm
 import battery_env
 import sb3_lac
 from battery_env.evaluation import over_seeds
-from battery_env.files import check_folder, replacing, set_aside
+from battery_env.files import check_folder, rename_damaged, replacing
 from battery_env.lab.batch import interruptible, workers
 from battery_env.plotting import new_figure, save_figure
 
@@ -444,7 +444,7 @@ def recall(file: Path) -> dict[str, Any] | None:
         content = json.loads(file.read_text(encoding="utf-8"))
         return {**content, "versions": content["versions"]}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        print(f"{file} is damaged ({error!r}): it is kept as {set_aside(file).name}, and made again", file=sys.stderr)
+        print(f"{file} is damaged ({error!r}): it is kept as {rename_damaged(file).name}, and made again", file=sys.stderr)
         return None
 
 

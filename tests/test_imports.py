@@ -75,8 +75,8 @@ def test_kernels_of_other_code_are_forgotten_and_those_of_this_one_stay(tmp_path
 
 def test_whoever_waits_for_the_first_compilation_is_told(tmp_path):
     code = (
-        "from battery_env.compiled import saying_that_it_compiles\nfrom battery_env.electrochemistry import kernels\n"
-        "with saying_that_it_compiles():\n    kernels.logarithm(1.0), kernels.logarithm(2)\n"
+        "from battery_env.compiled import announce_compilation\nfrom battery_env.electrochemistry import kernels\n"
+        "with announce_compilation():\n    kernels.logarithm(1.0), kernels.logarithm(2)\n"
     )
     said = []
     for _ in range(2):

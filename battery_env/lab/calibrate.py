@@ -27,7 +27,7 @@ from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.forecast import Forecast, forecast
 from battery_env.lab.readers.columns import FileFormat
-from battery_env.lab.readers.discharges import each_usable, read_recordings
+from battery_env.lab.readers.discharges import map_usable, read_recordings
 from battery_env.lab.readers.testers import Tester, find_tester
 from battery_env.lab.report import Calibration
 from battery_env.lab.settings import Settings, SettingsOptions
@@ -114,7 +114,7 @@ def calibrate(
     file_format = FileFormat(**of_file | {"tester": find_tester(of_file.get("tester"))})
     sources = find_sources([os.fspath(source)]) if isinstance(source, str | os.PathLike) else []
     readers = {each.argument: partial(read_source, each, file_format) for each in sources}
-    return each_usable(
+    return map_usable(
         lambda each: calibrated(each, settings), readers or {"DataFrame": partial(read_recordings, source, file_format)}
     )
 

@@ -20,7 +20,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
-from battery_env.compiled import saying_that_it_compiles
+from battery_env.compiled import announce_compilation
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.estimators.joint_fit import fit_cell
 from battery_env.estimators.search import spread_over
@@ -36,7 +36,7 @@ from battery_env.lab.sources import VOLTAGE, Source, few_of, find_sources, read_
 from battery_env.loads import constant
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge
-from battery_env.records.refusals import Origin, RecordError
+from battery_env.records.refusals import Advice, Origin, RecordError
 from battery_env.records.samples import check_cut_off
 
 #: What the process returns: all records settled, one or more refused, one or more not settled, stopped, nobody reads on.
@@ -353,7 +353,7 @@ def _calibrate_all(
     try:
         is_serial = options.jobs == 1 and options.scheduler is None
         side_by_side = nullcontext() if is_serial else workers(options.jobs, options.scheduler)
-        with side_by_side as executor, saying_that_it_compiles():
+        with side_by_side as executor, announce_compilation():
             ahead = 64 if options.scheduler or options.jobs < 1 else 2 * options.jobs
             for outcome in calibrate_all(sources, file_format, settings, results, executor, ahead):
                 _report(outcome, options.json)
@@ -440,7 +440,7 @@ def _fit(arguments: Sequence[str]) -> int:
         check_cut_off(options.cut_off)
     discharges = _discharges(options.records, _file_format(options))
     print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
-    with warnings.catch_warnings(), saying_that_it_compiles():
+    with warnings.catch_warnings(), announce_compilation():
         warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
         found = fit_cell(discharges, options.cut_off)
     print(found.summary())
@@ -468,7 +468,7 @@ def _forecast(arguments: Sequence[str]) -> int:
     figure = figure_of(options.record, options.out) if options.out else None
     if figure:
         check_new(figure)
-    with _saying(), saying_that_it_compiles():
+    with _saying(), announce_compilation():
         end = end_of_record(options.record, settings, file_format, options.life, options.load)
     print(json.dumps(end.row()) if options.json else end.text())
     if figure:
@@ -513,7 +513,8 @@ def _columns(arguments: Sequence[str]) -> int:
     with replacing(options.out, new=True) as part:
         part.write_text(tester_file(found.columns, opened.names, opened.rows), encoding="utf-8")
     then = "Fill in what is not found" if found.missing else "Change what is wrong"
-    print(f"\nwritten: {options.out}. {then}, and calibrate: {_NAME} {options.record} --tester {options.out}")
+    command = Origin(str(options.record)).command(Advice(then, "tester", options.out))
+    print(f"\nwritten: {options.out}. {then}, and calibrate: {command}")
     return NOT_SETTLED if found.missing else SETTLED
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
 
-from battery_env.checks import check_positive, hinting
+from battery_env.checks import check_positive, with_option_hints
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.cell import Q_MOBILE_PER_CAPACITY, new_cell_of
@@ -63,7 +63,7 @@ class ResolvedSettings(NamedTuple):
     usual_start: DischargeStart | None
 
 
-@hinting
+@with_option_hints
 @dataclass(frozen=True)
 class Settings:
     """

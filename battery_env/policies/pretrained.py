@@ -64,8 +64,8 @@ def policy_of_file(file: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
 def write_card(file: Path, content: Mapping[str, Any]) -> None:
     """Write the card of a policy, a JSON file of the same name, with the checksums of both files."""
     card = {**content, "sha256": sha256(file.read_bytes()).hexdigest()}
-    with replacing(file.with_suffix(".json")) as part:
-        part.write_text(json.dumps({**card, "card_sha256": _digest(card)}, indent=2) + "\n", encoding="utf-8")
+    with replacing(file.with_suffix(".json")) as temporary:
+        temporary.write_text(json.dumps({**card, "card_sha256": _digest(card)}, indent=2) + "\n", encoding="utf-8")
 
 
 def _read_card(file: Path) -> dict[str, Any]:

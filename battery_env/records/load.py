@@ -179,10 +179,10 @@ def rest_current_A(current_A: FloatArray) -> float | None:
     rest_before, rest_after = (
         side_A[np.abs(side_A) <= LOAD_SHARE * largest_A] for side_A in (current_A[: loaded[0]], current_A[loaded[-1] + 1 :])
     )
-    before_A, after_A = (float(np.median(side_A)) if len(side_A) else 0.0 for side_A in (rest_before, rest_after))
+    first_A, last_A = (float(np.median(side_A)) if len(side_A) else 0.0 for side_A in (rest_before, rest_after))
     if not len(rest_after):
-        return before_A if len(rest_before) else None
-    return min(before_A, after_A, key=abs) if before_A * after_A > 0.0 else 0.0
+        return first_A if len(rest_before) else None
+    return min(first_A, last_A, key=abs) if first_A * last_A > 0.0 else 0.0
 
 
 class SwitchedCharge(NamedTuple):

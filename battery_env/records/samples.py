@@ -114,11 +114,11 @@ def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray
     return array
 
 
-def _implausible(name: str, value: float, where: str = "") -> RecordError:
+def _implausible(name: str, value: float, location: str = "") -> RecordError:
     low, high, unit = PLAUSIBLE[name]
     # a value that is too low has no other unit: it may be a negative voltage of a half cell
     advice = _ADVICE_BEYOND[name] if value > high or low == -high else ()
-    return RecordError(f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}", advice)
+    return RecordError(f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{location}", advice)
 
 
 def check_record(record: Record, least_samples: int = 1) -> Samples:

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from battery_env.files import call_alone
+from battery_env.files import call_in_process
 from battery_env.lab.readers import nasa
 from battery_env.lab.readers.discharges import read_discharges
 from battery_env.records import integrate_load, resample_current
@@ -271,7 +271,7 @@ class TestNasaMatFile:
 
     def test_a_reader_that_dies_is_an_error_of_its_file_alone(self, tmp_path, monkeypatch):
         self.write(tmp_path / "B1.mat")
-        monkeypatch.setattr(nasa, "call_alone", lambda *given, **options: call_alone("os", "_exit", 139))
+        monkeypatch.setattr(nasa, "call_in_process", lambda *given, **options: call_in_process("os", "_exit", 139))
         with pytest.raises(ValueError, match=r"B1\.mat: the file is damaged, .*os\._exit ended its process with 139"):
             read_discharges(tmp_path / "B1.mat")
 

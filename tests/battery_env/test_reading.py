@@ -24,7 +24,7 @@ from battery_env.lab import running as running_module
 from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.discharges import read_recordings
-from battery_env.lab.readers.testers import TESTERS, joined
+from battery_env.lab.readers.testers import TESTERS, merge
 from battery_env.lab.sources import Source, find_sources
 from tests.sweeps import sweep
 from tests.tables import LOADED, RECORD, TABLE, clock, near, read
@@ -666,9 +666,9 @@ def test_a_tester_is_told_by_its_names_or_added_by_a_file(tmp_path, monkeypatch,
 
 def test_every_row_of_the_table_reads_its_own_names():
     for tester in TESTERS[:-1]:
-        known = joined(tester, TESTERS[-1])
+        known = merge(tester, TESTERS[-1])
         names = {quantity: known.columns[quantity][0] for quantity in ("time", "voltage", "current")}
-        marks = {name: 20.0 for name in tester.told_by[:1] if name not in names.values()}
+        marks = {name: 20.0 for name in tester.marks[:1] if name not in names.values()}
         table = pd.DataFrame({names[each]: TABLE[each] for each in names} | marks)
         for quantity, unit in (("voltage", "mV"), ("current", "mA")):
             table[names[quantity]] *= 1e3 if unit in names[quantity] else 1.0

@@ -115,9 +115,9 @@ def gaps_of(record: Samples, model_V: FloatArray, q_mobile: float, samples: Meas
     gaps, expected, gap = Gaps(), _ExpectedVoltage(), None
     time_s, interval_s = record.time_s - record.time_s[0], np.diff(record.time_s)
     size_A = np.abs(record.current_A)
-    load_A, before_s = np.maximum(size_A[1:], size_A[:-1]), np.append(0.0, interval_s[:-1])
-    charge_C = load_A * (interval_s - before_s)
-    may_be_gap = (interval_s > _RATIO * before_s) & (load_A > REST_CURRENT_A) & (charge_C > _LEAST_SHARE * q_mobile)
+    load_A, previous_s = np.maximum(size_A[1:], size_A[:-1]), np.append(0.0, interval_s[:-1])
+    charge_C = load_A * (interval_s - previous_s)
+    may_be_gap = (interval_s > _RATIO * previous_s) & (load_A > REST_CURRENT_A) & (charge_C > _LEAST_SHARE * q_mobile)
     if not may_be_gap.any():
         return gaps
     measured_rows = np.cumsum(np.isfinite(record.voltage_V)) - 1

@@ -1,4 +1,4 @@
-"""Which column of a table is which measurement, and in which unit: by the names of the testers' table, or as is stated."""
+"""The quantities and units of the columns of a table, by the names of testers, or as stated."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import NamedTuple
 from unicodedata import normalize
 
 from battery_env.checks import ZERO_CELSIUS_K
-from battery_env.lab.readers.testers import INSTEAD, LONGEST, QUANTITIES, REQUIRED, TESTERS, Tester, joined, words_of
+from battery_env.lab.readers.testers import LONGEST, QUANTITIES, REQUIRED, SUBSTITUTES, TESTERS, Tester, merge, words_of
 from battery_env.records.refusals import Advice, RecordError
 
-# Quantities that only a name with a unit is: p and q may be anything.
+# Quantities whose names need a unit: p and q may mean anything.
 _WITH_UNIT = ("counter", "power", "charge_step", "capacity")
 
 
@@ -36,7 +36,7 @@ _TIMES = _units(
 _VOLTS = _units({"v volt volts": 1.0, "mv mvolt mvolts": 1e-3})
 _CHARGES = _units({"mah": 3.6, "ah ahr amphr": 3600.0})
 _DEGREES = dict(_units({"c degc celsius": 1.0}), k=(1.0, -ZERO_CELSIUS_K), kelvin=(1.0, -ZERO_CELSIUS_K))
-# By quantity and unit in small letters alone: factor and offset to s, V, A, degC, W and C.
+# Factor and offset to s, V, A, degC, W and C, by quantity and by unit in small letters.
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "time": _TIMES,
     "date": _TIMES,
@@ -49,38 +49,38 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "ambient": _DEGREES,
     "capacity": _CHARGES,
 }
-# Units stand in brackets, or behind a stroke, or are the last word.
+# A unit stands in brackets, behind a stroke, or as the last word.
 _UNIT = re.compile(r"[(\[](?P<bracket>[^()\[\]]*)[)\]]|/(?P<stroke>[^/]*)$")
 # A stated unit may have a number, as in 0.01 A.
-_SCALED = re.compile(r"^\s*(\d+\.?\d*|\.\d+|)(.*)")
-# A unit of text such as 1:02:03.5, which becomes seconds when it is read, by its letters.
+_SCALED_UNIT = re.compile(r"^\s*(\d+\.?\d*|\.\d+|)(.*)")
+# Letters of a unit of text such as 1:02:03.5, which is read as seconds.
 _CLOCK = re.compile(r"(?:hours?in)?h+m+(?:in)?s+[msfxz]*$")
-# What testers call the steps in which a cell is discharged, and those of other words in which it is charged.
+# Words of testers for a discharge, and, among all other words, for a charge.
 _DISCHARGE = re.compile(r"\bd\b|\bdis\b|dch|dsg|disch|entlad|放电")
 _CHARGE = re.compile(r"\bc\b|ch|lad|充电")
 
 
 class Column(NamedTuple):
-    """A column and what makes SI of it."""
+    """A column and its conversion to SI units."""
 
     position: int  # among the columns of the table
-    name: str  # as the table has it
-    unit: str = ""  # as its name or the caller says, empty if neither does
-    factor: float = 1.0  # makes s, V or A of its values, or differences of temperature in K
-    offset: float = 0.0  # is added then
+    name: str  # in the table
+    unit: str = ""  # stated, or in the name; empty if neither
+    factor: float = 1.0  # of the values, to s, V, A, or differences of temperature in K
+    offset: float = 0.0  # added after the factor
 
 
 @dataclass(frozen=True)
 class FileFormat:
     """
-    What files do not tell of themselves, see :func:`battery_env.read_discharges`.
+    What a user states about a file, see :func:`battery_env.read_discharges`.
 
-    :param columns: by quantity, the name of its column
-    :param units: by quantity, its unit
-    :param discharge_is_negative: how the file counts the current of a discharge; ``None``: told from the voltage
-    :param ignore: names of columns that are not looked at
-    :param tester: whose table it is; ``None``: told from the names
-    :param load: times in s and currents in A, or powers in W, of a load that the file does not hold, and its unit
+    :param columns: names of columns, by quantity
+    :param units: units, by quantity
+    :param discharge_is_negative: whether the current of a discharge is negative; ``None``: by words or voltage
+    :param ignore: names of columns to ignore
+    :param tester: the tester of the table; ``None``: by the names
+    :param load: times in s and currents in A, or powers in W, of a load that is not in the file, and its unit
     """
 
     columns: Mapping[str, str] | None = None
@@ -91,23 +91,24 @@ class FileFormat:
     load: tuple[list[float], list[float], str] | None = None
 
 
-class Recognised(NamedTuple):
-    """What is known of a table by its header."""
+class TableHeader(NamedTuple):
+    """The recognised header of a table."""
 
     tester: Tester
-    columns: dict[str, Column]  # by quantity; of names as good as that of voltage, voltage2 is the second
-    missing: list[str]  # quantities that a record must have
-    names: Sequence[str]  # all of the table
-    rows: Sequence[Sequence[str]]  # fields of its first rows
+    columns: dict[str, Column]  # by quantity; voltage2 has a name that suits the voltage equally well
+    missing: list[str]  # required quantities without a column
+    names: Sequence[str]  # all names
+    rows: Sequence[Sequence[str]]  # fields of the first rows
 
     def lines(self) -> list[str]:
-        """What the table begins with, and what is known of it."""
-        told = {"header": ", ".join(self.names)}
-        told |= {f"row {n}": ", ".join(row) for n, row in enumerate(self.rows[:2], start=1)}
-        told |= {"tester": self.tester.name}
-        told |= {key: f"{each.name!r}{f' in {each.unit}' if each.unit else ''}" for key, each in self.columns.items()}
-        told |= {each: "not found" for each in self.missing} | {"not used": ", ".join(self._unused())}
-        return [f"{key:<12}{text[:LONGEST]}{' ...' * (len(text) > LONGEST)}".rstrip() for key, text in told.items()]
+        """Return the beginning of the table, and its recognised columns, as lines of text."""
+        entries = {"header": ", ".join(self.names)}
+        entries |= {f"row {n}": ", ".join(row) for n, row in enumerate(self.rows[:2], start=1)}
+        entries |= {"tester": self.tester.name}
+        units = {key: f" in {column.unit}" if column.unit else "" for key, column in self.columns.items()}
+        entries |= {key: f"{column.name!r}{units[key]}" for key, column in self.columns.items()}
+        entries |= {quantity: "not found" for quantity in self.missing} | {"not used": ", ".join(self._unused())}
+        return [f"{key:<12}{text[:LONGEST]}{' ...' * (len(text) > LONGEST)}".rstrip() for key, text in entries.items()]
 
     def _unused(self) -> list[str]:
         used = {column.position for column in self.columns.values()}
@@ -115,120 +116,120 @@ class Recognised(NamedTuple):
 
     @property
     def open_questions(self) -> frozenset[str]:
-        """What may be stated: units that nothing tells, and the sign."""
-        return frozenset(each for each, column in self.columns.items() if not column.unit) | {"is positive", "is negative"}
+        """Quantities without a unit, and both signs of the current."""
+        return frozenset(key for key, column in self.columns.items() if not column.unit) | {"is positive", "is negative"}
 
-    def check(self) -> Recognised:
-        """Refuse a table of which quantities are missing, and name what may be them: columns with such a unit, or else any."""
+    def check(self) -> TableHeader:
+        """Refuse a table without required quantities, and propose columns for these: with a suitable unit, or else any."""
         if not self.missing:
             return self
         unused = self._unused()
-        fitting = {each: [name for name in unused if _unit_in(name, each)] for each in self.missing}
-        others = iter([name for name in unused if not any(name in names for names in fitting.values())])
-        named = {each: names or [next(others, "NAME")] for each, names in fitting.items()}
-        choices = range(max(map(len, named.values())))
-        likely = [{each: names[min(n, len(names) - 1)] for each, names in named.items()} for n in choices]
-        advice = [Advice("Name the columns, or their places", "columns", each) for each in likely]
+        candidates = {quantity: [name for name in unused if _unit_in(name, quantity)] for quantity in self.missing}
+        further = iter([name for name in unused if not any(name in names for names in candidates.values())])
+        candidates = {quantity: names or [next(further, "NAME")] for quantity, names in candidates.items()}
+        count = max(map(len, candidates.values()))
+        proposals = [{key: names[min(n, len(names) - 1)] for key, names in candidates.items()} for n in range(count)]
+        advice = [Advice("Name the columns, or their places", "columns", proposal) for proposal in proposals]
         raise RecordError(f"no column for the {', the '.join(self.missing)}", advice)
 
 
-def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]]) -> Recognised:
+def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]]) -> TableHeader:
     """
-    Which tester's table it is, the first of which it has a mark, and its columns. A unit is told from the name, as in
-    ``Current(mA)``, ``Voltage / V``, ``mAmps`` or ``test_time_second``, or from the line below it; one of another quantity
-    rules a column out.
+    Recognise the tester of a table, the first with a mark in the header, and its columns. A name, as in ``Current(mA)``,
+    ``Voltage / V``, ``mAmps`` or ``test_time_second``, or the line below it, gives the unit. A column with a unit of another
+    quantity is excluded.
     """
     names = [str(name).strip() for name in names]
     labels = _labels(names, rows, {name.strip() for name in file_format.ignore})
-    keys = {key for label in labels for key, _ in _parted(label)}
-    marked = [each for each in TESTERS if any("".join(words_of(name)) in keys for name in each.told_by)]
-    tester = file_format.tester or (joined(marked[0], TESTERS[-1]) if marked else TESTERS[-1])
+    keys = {key for label in labels for key, _ in _name_candidates(label)}
+    testers = [tester for tester in TESTERS if any("".join(words_of(mark)) in keys for mark in tester.marks)]
+    tester = file_format.tester or (merge(testers[0], TESTERS[-1]) if testers else TESTERS[-1])
     units = {**tester.units, **(file_format.units or {})}
-    chosen = _places_of(file_format.columns or {}, units, names)
+    stated = _stated_positions(file_format.columns or {}, units, names)
     ranks = [_ranks(label, tester) for label in labels]
-    found = dict[str, Column]()
+    columns = dict[str, Column]()
     for quantity in QUANTITIES:
-        if quantity in INSTEAD["current"] and ("current" in found or file_format.load):
+        if quantity in SUBSTITUTES["current"] and ("current" in columns or file_format.load):
             continue
-        # a column is one thing, but where the caller says otherwise
-        used = {column.position for column in found.values()} | set(chosen.values())
-        free = {n: each[quantity] for n, each in enumerate(ranks) if quantity in each and n not in used}
-        places = [n for n, rank in free.items() if rank == min(free.values())]
-        if quantity in chosen:
-            places = [chosen[quantity]]
-        scale, stated = _SCALED.findall(units.get(quantity, ""))[0]
-        for number, place in enumerate(places if quantity in REQUIRED else places[:1], start=1):
-            unit = _unit(stated, quantity) or _unit_in(labels[place], quantity)
+        # a column serves one quantity, unless the caller states otherwise
+        taken = {column.position for column in columns.values()} | set(stated.values())
+        free_ranks = {n: rank[quantity] for n, rank in enumerate(ranks) if quantity in rank and n not in taken}
+        positions = [n for n, rank in free_ranks.items() if rank == min(free_ranks.values())]
+        if quantity in stated:
+            positions = [stated[quantity]]
+        scale, stated_unit = _SCALED_UNIT.findall(units.get(quantity, ""))[0]
+        for number, position in enumerate(positions if quantity in REQUIRED else positions[:1], start=1):
+            unit = _unit(stated_unit, quantity) or _unit_in(labels[position], quantity)
             if unit or quantity not in _WITH_UNIT:
                 factor, offset = _UNITS.get(quantity, {}).get(unit, (1.0, 0.0))
                 key = quantity if number == 1 else f"{quantity}{number}"
-                found[key] = Column(place, names[place], unit, float(scale or 1.0) * factor, offset)
-    given = {"current"} if file_format.load else set[str]()
-    missing = [each for each in REQUIRED if not {each, *INSTEAD.get(each, ())} & (set(found) | given)]
-    return Recognised(tester, found, missing, names, rows)
+                columns[key] = Column(position, names[position], unit, float(scale or 1.0) * factor, offset)
+    substituted = {"current"} if file_format.load else set[str]()
+    missing = [key for key in REQUIRED if not {key, *SUBSTITUTES.get(key, ())} & (set(columns) | substituted)]
+    return TableHeader(tester, columns, missing, names, rows)
 
 
-def _places_of(columns: Mapping[str, str], units: Mapping[str, str], names: Sequence[str]) -> dict[str, int]:
-    """Which column is stated for each quantity, by its name, or else by its place from 1 on."""
-    for option, told in (("columns", columns), ("units", units)):
-        if unknown := set(told) - set(QUANTITIES):
+def _stated_positions(columns: Mapping[str, str], units: Mapping[str, str], names: Sequence[str]) -> dict[str, int]:
+    """Return the positions of stated columns, by name, or else by number from 1 on."""
+    for option, stated in (("columns", columns), ("units", units)):
+        if unknown := set(stated) - set(QUANTITIES):
             raise ValueError(f"{option} knows {', '.join(QUANTITIES)}, got {', '.join(sorted(unknown))}")
-    known = [*names, *(str(n + 1) for n in range(len(names)))]
+    labels = [*names, *(str(n + 1) for n in range(len(names)))]
     for quantity, name in columns.items():
-        if name.strip() not in known:
+        if name.strip() not in labels:
             raise ValueError(f"there is no column {name!r} for the {quantity} among {', '.join(filter(None, names))}")
     for quantity, unit in units.items():
         if quantity in _UNITS and not _unit(unit, quantity):
             raise ValueError(f"the unit {unit!r} of the {quantity} is not known, but {', '.join(_UNITS[quantity])}")
-    return {quantity: known.index(name.strip()) % len(names) for quantity, name in columns.items()}
+    return {quantity: labels.index(name.strip()) % len(names) for quantity, name in columns.items()}
 
 
 def _labels(names: Sequence[str], rows: Sequence[Sequence[str]], ignore: Collection[str]) -> list[str]:
-    """Names of columns that are looked at, with the units that are written below them, where they have none themselves."""
+    """Return the names of columns, empty if ignored, with the units in the line below if the names have none."""
     labels = ["" if name in ignore else name for name in names]
     if not (rows and are_units(rows[0])):
         return labels
-    below = [text.strip("[]()- ") for text in [*rows[0], *[""] * len(labels)]]
-    return [f"{name} ({unit})" if name and not _UNIT.search(name) else name for name, unit in zip(labels, below, strict=False)]
+    units = [text.strip("[]()- ") for text in [*rows[0], *[""] * len(labels)]]
+    return [f"{name} ({unit})" if name and not _UNIT.search(name) else name for name, unit in zip(labels, units, strict=False)]
 
 
 def _ranks(label: str, tester: Tester) -> dict[str, int]:
-    """The quantities that a name may be, by its unit too, and its rank among the names of each."""
-    found: dict[str, int] = {}
-    for key, unit in _parted(label):
+    """Return the quantities that a name and its unit suit, with the rank of the name for each."""
+    ranks: dict[str, int] = {}
+    for key, unit in _name_candidates(label):
         for quantity, rank in tester.ranks.get(key, {}).items():
             if quantity not in _UNITS or not _letters(unit) or _unit(unit, quantity):
-                found.setdefault(quantity, rank)
-    return found
+                ranks.setdefault(quantity, rank)
+    return ranks
 
 
 @lru_cache(maxsize=4096)
-def _parted(name: str) -> tuple[tuple[str, str], ...]:
-    """What a name may be, and its unit: the whole, what is in brackets or behind a stroke, the last word."""
+def _name_candidates(name: str) -> tuple[tuple[str, str], ...]:
+    """Return possible names and units of a column: the unit in brackets, behind a stroke, or as the last word."""
     name = normalize("NFKC", name)[:LONGEST]
     words, match = words_of(name), _UNIT.search(name)
-    found = [("".join(words), "")]
+    candidates = [("".join(words), "")]
     if match:
         base = name[: match.start()] + name[match.end() :]
-        found.append(("".join(words_of(base)), match["bracket"] or match["stroke"] or ""))
+        candidates.append(("".join(words_of(base)), match["bracket"] or match["stroke"] or ""))
     if len(words) > 1 and any(_unit(words[-1], quantity) for quantity in _UNITS):
-        found.append(("".join(words[:-1]), words[-1]))
-    return tuple(found)
+        candidates.append(("".join(words[:-1]), words[-1]))
+    return tuple(candidates)
 
 
 def _unit_in(name: str, quantity: str) -> str:
-    """The unit in a name, whatever the rest of it is: one that is the whole name, as mAmps, too."""
-    (whole, _), *parted = _parted(name)
-    return next((unit for text in (whole, *(unit for _, unit in parted)) if (unit := _unit(text, quantity))), "")
+    """Return the unit in a name, which may be the whole name, as in mAmps; empty if none."""
+    (full_name, _), *candidates = _name_candidates(name)
+    return next((unit for text in (full_name, *(unit for _, unit in candidates)) if (unit := _unit(text, quantity))), "")
 
 
 def _letters(text: str) -> str:
-    """A unit by its letters: signs of degrees are lost by encodings, and dots and strokes part factors."""
+    """Return the letters of a unit, because encodings lose signs of degrees, and dots and strokes separate factors."""
     return re.sub(r"[^a-z\u03bc]", "", normalize("NFKC", text).lower())
 
 
 def _unit(text: str, quantity: str) -> str:
-    """A unit as the table of units has it, or nothing; what is said behind it, as in ``V vs. Ref.``, is left out."""
+    """Return a unit as in the table of units, without any text behind it, as in ``V vs. Ref.``; empty if unknown."""
     if quantity == "time" and _CLOCK.match(_letters(text)):
         return "s"
     units = map(_letters, (text, text.strip().partition(" ")[0]))
@@ -236,26 +237,26 @@ def _unit(text: str, quantity: str) -> str:
 
 
 def are_units(fields: Sequence[str]) -> bool:
-    """Whether the line below a header holds units, where some testers write them; a clock may have none."""
+    """Whether the line below a header holds units; a clock may have none."""
     return not any(map(str.isdigit, "".join(fields))) and all(
         any(_unit(text, quantity) for text in fields) for quantity in ("voltage", "current")
     )
 
 
 def count_required(names: Iterable[str], file_format: FileFormat) -> int:
-    """How much a line looks like the header of a record."""
+    """Count the required quantities in a line, which may be a header."""
     stated = {name.strip(): quantity for quantity, name in (file_format.columns or {}).items()}
-    found = {quantity for name in names for quantity in _ranks(name, file_format.tester or TESTERS[-1])}
-    found |= {stated[name.strip()] for name in names if name.strip() in stated}
-    return sum(bool(found & {quantity, *INSTEAD.get(quantity, ())}) for quantity in REQUIRED)
+    quantities = {quantity for name in names for quantity in _ranks(name, file_format.tester or TESTERS[-1])}
+    quantities |= {stated[name.strip()] for name in names if name.strip() in stated}
+    return sum(bool(quantities & {quantity, *SUBSTITUTES.get(quantity, ())}) for quantity in REQUIRED)
 
 
 def direction(state: object) -> int:
-    """1 for what a tester calls a discharge, -1 for a charge, else 0."""
+    """Return 1 for a tester's word for discharge, -1 for a word for charge, else 0."""
     words = " ".join(words_of(str(state)))
     return 1 if _DISCHARGE.search(words) else -1 if _CHARGE.search(words) else 0
 
 
-def say(text: str) -> None:
-    """Tell who reads a file what was done to it."""
+def notify(text: str) -> None:
+    """Warn the reader of a file of a correction."""
     warnings.warn(text, stacklevel=3)

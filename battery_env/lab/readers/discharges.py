@@ -1,4 +1,4 @@
-"""Recorded discharges from files and tables of testers: which of the rows are a discharge, and what is known beside it."""
+"""Recorded discharges from files and tables of testers: the rows of each discharge, and its history."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ import pandas as pd
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_LIMITS
-from battery_env.lab.readers.columns import FileFormat, recognise, say
+from battery_env.lab.readers.columns import FileFormat, notify, recognise
 from battery_env.lab.readers.nasa import read_nasa_mat
 from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, changes, refuse_other_unit, rows_of
-from battery_env.lab.readers.signs import MUCH_SHARE, with_signed_current
+from battery_env.lab.readers.signs import LARGE_SHARE, with_signed_current
 from battery_env.lab.readers.tables import check_mat, open_file, open_frame
 from battery_env.lab.readers.testers import REQUIRED, Tester, find_tester
 from battery_env.records import (
@@ -37,14 +37,14 @@ from battery_env.records.recording import Recording
 from battery_env.records.refusals import TABLE, Origin, RecordError
 from battery_env.records.samples import SIGNS
 
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
-# A charge ends a discharge if it returns more than this share of the charge drawn until then; less is braking, or is told.
-_RETURNED_SHARE = 0.2
-# A charge before the load is cut off if it exceeds this share of the charge drawn; a smaller one is sensor offset. A charge
-# within the load ends the discharge only if it returns more than this share of the largest charge drawn: early pulses return
-# much of the little drawn yet.
-_CHARGED_SHARE = 0.02
+# A charge ends a discharge if it returns more than this share of the charge drawn; less is braking, unless the file marks it.
+_END_CHARGE_SHARE = 0.2
+# A charge before the load is cut off if it exceeds this share of the charge drawn; a smaller charge is sensor offset. A charge
+# within the load ends the discharge only if it returns more than this share of the largest charge drawn, because early pulses
+# return a large share of the charge so far.
+_LEAST_CHARGE_SHARE = 0.02
 
 
 def read_discharges(
@@ -88,12 +88,12 @@ def read_discharges(
     :raises ImportError: if the file needs an extra that is not installed
     """
     file_format = FileFormat(columns, units, discharge_is_negative, ignore, find_tester(tester))
-    return each_usable(lambda each: each, {_name_of(source): lambda: read_recordings(source, file_format)})
+    return map_usable(lambda discharge: discharge, {_name_of(source): lambda: read_recordings(source, file_format)})
 
 
-def each_usable(use: Callable[[Discharge], Made], readers: Mapping[str, Callable[[], list[Recording]]]) -> list[Made]:
-    """What is made of each discharge, by sources and what reads each; a warning tells what is left out, if not all is."""
-    made, errors = [], []
+def map_usable(use: Callable[[Discharge], Result], readers: Mapping[str, Callable[[], list[Recording]]]) -> list[Result]:
+    """Apply a function to each discharge of some sources, given their readers; warn of failures, unless all fail."""
+    results, errors = [], []
     for name, read in readers.items():
         try:
             recordings = read()
@@ -102,18 +102,18 @@ def each_usable(use: Callable[[Discharge], Made], readers: Mapping[str, Callable
             continue
         for recording in recordings:
             try:
-                made.append(use(recording.discharge()))
+                results.append(use(recording.discharge()))
             except (TypeError, ValueError) as error:
                 number = f"discharge {recording.meta['cycle']}: " if "cycle" in recording.meta else ""
                 errors.append(ValueError(f"{name}: {number}{error}"))
     try:
-        if not made:
+        if not results:
             raise errors[0]
         for reason in errors:
             warnings.warn(f"It is left out: {reason}", stacklevel=3)
     finally:
-        errors.clear()  # an error holds the frame that holds it, and with it what its reader had opened
-    return made
+        errors.clear()  # an error keeps its frame alive, and so the files of its reader
+    return results
 
 
 def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) -> Discharge:
@@ -132,29 +132,29 @@ def read_discharge_csv(path: str | Path, discharge_is_negative: bool = False) ->
 
 
 def read_recordings(source: str | Path | pd.DataFrame, file_format: FileFormat) -> list[Recording]:
-    """The discharges of a file or a table, one at least, before they are checked: one that cannot be used loses no other."""
+    """Return the discharges of a file or a table, at least one, unchecked, so that an invalid one loses no other."""
     name = _name_of(source)
-    told = Origin(name)
+    origin = Origin(name)
     lines: list[str] = []
     try:
         if not isinstance(source, pd.DataFrame) and Path(source).suffix.lower() == ".mat":
             check_mat(Path(source))
-            told = Origin(name, frozenset())
-            recordings = [Recording(arrays, meta, told) for arrays, meta in read_nasa_mat(Path(source))]
+            origin = Origin(name, frozenset())
+            recordings = [Recording(arrays, meta, origin) for arrays, meta in read_nasa_mat(Path(source))]
         else:
-            opened = open_frame(source) if isinstance(source, pd.DataFrame) else open_file(Path(source), file_format)
-            known = recognise(opened.names, file_format, opened.rows)
-            lines, told = known.lines(), Origin(name, known.open_questions, vars(file_format))
-            rows = rows_of(opened.read(known.check()), known, file_format)
-            if not file_format.load:  # which is what it says
-                before_A, rows = rows["current"], with_signed_current(rows, known, file_format.discharge_is_negative)
-                taken = "is negative" if (before_A * rows["current"]).sum() < 0.0 else "is positive"
-                told = replace(told, open_questions=known.open_questions - {taken})
-            recordings = _split(rows, told)
+            table = open_frame(source) if isinstance(source, pd.DataFrame) else open_file(Path(source), file_format)
+            header = recognise(table.names, file_format, table.rows)
+            lines, origin = header.lines(), Origin(name, header.open_questions, vars(file_format))
+            rows = rows_of(table.read(header.check()), header, file_format)
+            if not file_format.load:  # a stated load has the right sign
+                file_current_A, rows = rows["current"], with_signed_current(rows, header, file_format.discharge_is_negative)
+                sign = "is negative" if (file_current_A * rows["current"]).sum() < 0.0 else "is positive"
+                origin = replace(origin, open_questions=header.open_questions - {sign})
+            recordings = _split(rows, origin)
         if not recordings:
             raise ValueError("there is no discharge")
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: {RecordError.like(error).of(told, lines)}") from error
+        raise ValueError(f"{name}: {RecordError.like(error).of(origin, lines)}") from error
     return recordings
 
 
@@ -164,143 +164,147 @@ def _name_of(source: str | Path | pd.DataFrame) -> str:
     return TABLE if isinstance(source, pd.DataFrame) else str(source)
 
 
-class _Part(NamedTuple):
+class _Candidate(NamedTuple):
     """Rows of a table that may be a discharge."""
 
     rows: slice
     drawn_C: float
-    charge: slice  # the rows of the charge that ends where it begins, empty if there is none
+    charge: slice  # the rows of the charge before, empty if there is none
 
 
 def _split(rows: pd.DataFrame, origin: Origin) -> list[Recording]:
-    """The discharges among some rows; what is left aside is named."""
-    parts = [part for low, high in itertools.pairwise(_bounds(rows)) for part in _discharges(rows, low, high)]
-    if not parts:
-        raise _nothing_drawn(rows)
-    current_A, places = rows["current"].to_numpy(), rows.index + 1
-    # what no cell can draw is refused later, and is no measure of the others
-    largest_C = max((part.drawn_C for part in parts if current_A[part.rows].max() <= LOAD_LIMITS["current"]), default=0.0)
-    aside = [
-        f"{drawn_C / 3600.0:.3g} Ah in rows {places[part.start]} to {places[part.stop - 1]}"
-        for part, drawn_C, _ in parts
-        if NOTHING_SHARE**2 * largest_C < drawn_C < LOAD_SHARE * largest_C  # next to nothing is noise of a sensor
+    """Return the discharges of a table, and warn of small ones that are left out."""
+    candidates = [candidate for low, high in itertools.pairwise(_bounds(rows)) for candidate in _discharges(rows, low, high)]
+    if not candidates:
+        raise _no_discharge(rows)
+    current_A, row_numbers = rows["current"].to_numpy(), rows.index + 1
+    # a discharge at a current of no cell is refused later, and must not count as the largest
+    plausible = [candidate for candidate in candidates if current_A[candidate.rows].max() <= LOAD_LIMITS["current"]]
+    largest_C = max((candidate.drawn_C for candidate in plausible), default=0.0)
+    dropped = [
+        f"{drawn_C / 3600.0:.3g} Ah in rows {row_numbers[candidate.start]} to {row_numbers[candidate.stop - 1]}"
+        for candidate, drawn_C, _ in candidates
+        if NOTHING_SHARE**2 * largest_C < drawn_C < LOAD_SHARE * largest_C  # less is noise of a sensor
     ]
-    if aside:
-        first = "; ".join(aside[:3]) + (" and others" if len(aside) > 3 else "")
-        say(f"left aside, as they draw less than {LOAD_SHARE:.0%} of the largest: {len(aside)} ({first})")
-    parts = [part for part in parts if part.drawn_C >= LOAD_SHARE * largest_C]
-    histories = [ChargeHistory(charge=_charge_before(rows, part.charge)) for part in parts]
+    if dropped:
+        first = "; ".join(dropped[:3]) + (" and others" if len(dropped) > 3 else "")
+        notify(f"left aside, as they draw less than {LOAD_SHARE:.0%} of the largest: {len(dropped)} ({first})")
+    candidates = [candidate for candidate in candidates if candidate.drawn_C >= LOAD_SHARE * largest_C]
+    histories = [ChargeHistory(charge=_charge_before(rows, candidate.charge)) for candidate in candidates]
     meta: dict[str, Any] = {"source": origin.source}
-    metas = [meta | {"cycle": number} for number in range(1, len(parts) + 1)] if len(parts) > 1 else [meta]
-    found = zip(parts, histories, metas, strict=True)
-    return [_recording(rows.iloc[part.rows], history, each, len(parts) > 1, origin) for part, history, each in found]
+    tables, is_several = [rows.iloc[candidate.rows] for candidate in candidates], len(candidates) > 1
+    metas = [meta | {"cycle": number} for number in range(1, len(candidates) + 1)] if is_several else [meta]
+    entries = zip(tables, histories, metas, strict=True)
+    return [_recording(table, history, entry, is_several, origin) for table, history, entry in entries]
 
 
-def _nothing_drawn(rows: pd.DataFrame) -> RecordError:
-    """What rows are in which no charge is drawn: a charge, if the voltage rises with it."""
+def _no_discharge(rows: pd.DataFrame) -> RecordError:
+    """Return the error for rows without a discharge: a charge, if the voltage rises."""
     time_s, voltage_V, current_A = (rows[name].to_numpy() for name in REQUIRED)
-    charged_Ah = -float(_passed_C(time_s, current_A)[-1]) / 3600.0
-    begin_V, end_V = voltage_V[current_A < 0.0][[0, -1]] if (current_A < 0.0).any() else (0.0, 0.0)
-    if end_V > begin_V:
-        return RecordError(f"there is no discharge, but a charge of {charged_Ah:.4g} Ah, from {begin_V:.2f} to {end_V:.2f} V")
+    charged_Ah = -float(_net_charge_C(time_s, current_A)[-1]) / 3600.0
+    start_V, end_V = voltage_V[current_A < 0.0][[0, -1]] if (current_A < 0.0).any() else (0.0, 0.0)
+    if end_V > start_V:
+        return RecordError(f"there is no discharge, but a charge of {charged_Ah:.4g} Ah, from {start_V:.2f} to {end_V:.2f} V")
     return RecordError("there is no discharge, as no charge is drawn: check the sign of the current", SIGNS)
 
 
 def _bounds(rows: pd.DataFrame) -> list[int]:
     """
-    Where the number of the cycle changes, and a clock starts anew, or a current that no cell can draw begins or ends; or where
-    no charge is logged, and the voltage is back after it fell: counters may count loops.
+    Return the bounds of tests: where the number of the cycle changes, and the clock restarts, a current of no cell begins or
+    ends, or, without logged charges, the voltage returns after its fall. Counters may count loops otherwise.
     """
     time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
-    are_charges_logged = any(charge.is_end for charge in _charges(rows, _passed_C(time_s, current_A)))
+    are_charges_logged = any(charge.is_end for charge in _charges(rows, _net_charge_C(time_s, current_A)))
     bounds, numbers = [0], [0, *np.flatnonzero(changes(rows, "cycle")), len(rows)]
-    of_cell, top_V = True, -np.inf
+    is_plausible, top_V = True, -np.inf
     for begin, end in itertools.pairwise(numbers):
         highest_V = voltage_V[begin:end].max()
-        was_of_cell, of_cell = of_cell, np.abs(current_A[begin:end]).max() <= LOAD_LIMITS["current"]
+        was_plausible, is_plausible = is_plausible, np.abs(current_A[begin:end]).max() <= LOAD_LIMITS["current"]
         fell_V = top_V - voltage_V[begin - 1]  # a charge ends at the top
-        is_back = fell_V > MUCH_SHARE * np.ptp(voltage_V) and top_V - highest_V < MUCH_SHARE * fell_V
-        if begin and (time_s[begin] < time_s[begin - 1] or of_cell != was_of_cell or (is_back and not are_charges_logged)):
+        is_back = fell_V > LARGE_SHARE * np.ptp(voltage_V) and top_V - highest_V < LARGE_SHARE * fell_V
+        is_restart = time_s[begin] < time_s[begin - 1] or is_plausible != was_plausible
+        if begin and (is_restart or (is_back and not are_charges_logged)):
             bounds.append(int(begin))
             top_V = highest_V
         top_V = max(top_V, highest_V)
     return [*bounds, len(rows)]
 
 
-def _passed_C(time_s: FloatArray, current_A: FloatArray) -> FloatArray:
-    """The charge that has passed at each row, on a clock that does not go back."""
+def _net_charge_C(time_s: FloatArray, current_A: FloatArray) -> FloatArray:
+    """Return the net charge drawn at each row, on a clock that does not go back."""
     clock_s = np.append(0.0, np.cumsum(np.maximum(np.diff(time_s), 0.0)))
     return integrate_load(clock_s, current_A, clock_s)
 
 
-def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[_Part]:
-    """The discharges among some rows: from one charge to the next, without those before the load."""
+def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[_Candidate]:
+    """Return the discharges in a range of rows: from one charge to the next, without charges before the load."""
     time_s, current_A = (rows[name].to_numpy()[low:high] for name in ("time", "current"))
-    passed_C = _passed_C(time_s, current_A)
+    net_C = _net_charge_C(time_s, current_A)
     groups: list[list[_Charge]] = [[]]
-    for charge in _charges(rows[low:high], passed_C):
+    for charge in _charges(rows[low:high], net_C):
         groups += [[]] if charge.is_end else []
         groups[-1].append(charge)
     begins = [0, *(group[0].start for group in groups[1:]), high - low]
-    parts = []
+    candidates = []
     for begin, end, charges in zip(begins, begins[1:], groups, strict=False):
-        loaded = is_load(current_A[begin:end])
-        if not loaded.any():
+        is_loaded = is_load(current_A[begin:end])
+        if not is_loaded.any():
             continue
-        first, before = begin + int(loaded.argmax()), slice(begin, begin)
-        drawn_C = float(passed_C[first:end].max() - passed_C[first])
+        first, charge_rows = begin + int(is_loaded.argmax()), slice(begin, begin)
+        drawn_C = float(net_C[first:end].max() - net_C[first])
         for charge in charges:
             is_before = charge.stop <= (first if charge.is_braking else end)
-            if is_before and passed_C[charge.start] - passed_C[charge.stop - 1] > _CHARGED_SHARE * drawn_C:
-                begin, before = charge.stop, slice(charge.start, charge.stop)
+            if is_before and net_C[charge.start] - net_C[charge.stop - 1] > _LEAST_CHARGE_SHARE * drawn_C:
+                begin, charge_rows = charge.stop, slice(charge.start, charge.stop)
         if begin < end:
-            drawn_C = float(passed_C[begin:end].max() - passed_C[begin])
-            parts.append(_Part(slice(low + begin, low + end), drawn_C, slice(low + before.start, low + before.stop)))
-    return parts
+            drawn_C = float(net_C[begin:end].max() - net_C[begin])
+            charge_rows = slice(low + charge_rows.start, low + charge_rows.stop)
+            candidates.append(_Candidate(slice(low + begin, low + end), drawn_C, charge_rows))
+    return candidates
 
 
 class _Charge(NamedTuple):
-    """Rows in which the cell is charged."""
+    """Rows of a charge."""
 
     start: int
     stop: int
-    is_end: bool  # of the discharge before
-    is_braking: bool  # which returns less than was drawn, and ends none
+    is_end: bool  # whether it ends the discharge before
+    is_braking: bool  # whether it returns less than was drawn, and ends no discharge
 
 
-def _charges(rows: pd.DataFrame, passed_C: FloatArray) -> list[_Charge]:
-    """Where the cell is charged between two loads, in as many steps as there are; noise at rest is left aside."""
+def _charges(rows: pd.DataFrame, net_C: FloatArray) -> list[_Charge]:
+    """Return the charges between loads, which may have several steps, without noise at rest."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
-    state, cycle = (rows[each].to_numpy() if each in rows else 0.0 * time_s for each in ("state", "cycle"))
-    loaded = np.flatnonzero(current_A > LEAST_LOAD_SHARE * current_A.max())
+    state, cycle = (rows[name].to_numpy() if name in rows else 0.0 * time_s for name in ("state", "cycle"))
+    load_rows = np.flatnonzero(current_A > LEAST_LOAD_SHARE * current_A.max())
     is_strong = current_A < LEAST_LOAD_SHARE * current_A.min()
-    charging = np.concatenate([[False], current_A < 0.0, [False]])
-    starts, ends = np.flatnonzero(~charging[:-1] & charging[1:]), np.flatnonzero(charging[:-1] & ~charging[1:])
-    counts = passed_C[starts] - passed_C[ends - 1] > NOTHING_SHARE * float(np.ptp(passed_C))
-    n = np.searchsorted(loaded, starts[counts])
-    starts, ends = starts[counts][np.diff(n, prepend=-1) > 0], ends[counts][np.diff(n, append=len(rows) + 1) > 0]
-    least_C = _CHARGED_SHARE * float((passed_C - np.minimum.accumulate(passed_C)).max())
-    found, lowest_C, highest_C = [], passed_C[0], passed_C[0]
-    for start, end, after in zip(starts.tolist(), ends.tolist(), np.unique(n).tolist(), strict=True):
-        drawn_C, highest_C = passed_C[start] - lowest_C, max(highest_C, passed_C[start])
-        returned_C = passed_C[start] - passed_C[end - 1]
-        is_end = returned_C > _RETURNED_SHARE * drawn_C and highest_C - passed_C[end - 1] > least_C
-        strong = start + np.flatnonzero(is_strong[start:end])  # less is an offset at rest
-        if after and len(strong) and returned_C > least_C:
-            before = loaded[after - 1]
-            is_end |= state[strong].mean() < 0.0 or time_s[strong[0] - 1] - time_s[before] > STEADY_S
-            is_end |= (cycle[loaded[after : after + 1]] != cycle[before]).any()
+    is_charging = np.concatenate([[False], current_A < 0.0, [False]])
+    starts, ends = np.flatnonzero(~is_charging[:-1] & is_charging[1:]), np.flatnonzero(is_charging[:-1] & ~is_charging[1:])
+    is_relevant = net_C[starts] - net_C[ends - 1] > NOTHING_SHARE * float(np.ptp(net_C))
+    n = np.searchsorted(load_rows, starts[is_relevant])
+    starts, ends = starts[is_relevant][np.diff(n, prepend=-1) > 0], ends[is_relevant][np.diff(n, append=len(rows) + 1) > 0]
+    least_C = _LEAST_CHARGE_SHARE * float((net_C - np.minimum.accumulate(net_C)).max())
+    charges, lowest_C, highest_C = [], net_C[0], net_C[0]
+    for start, end, load_count in zip(starts.tolist(), ends.tolist(), np.unique(n).tolist(), strict=True):
+        drawn_C, highest_C = net_C[start] - lowest_C, max(highest_C, net_C[start])
+        returned_C = net_C[start] - net_C[end - 1]
+        is_end = returned_C > _END_CHARGE_SHARE * drawn_C and highest_C - net_C[end - 1] > least_C
+        strong_rows = start + np.flatnonzero(is_strong[start:end])  # smaller currents are an offset at rest
+        if load_count and len(strong_rows) and returned_C > least_C:
+            last_load_row = load_rows[load_count - 1]
+            is_end |= state[strong_rows].mean() < 0.0 or time_s[strong_rows[0] - 1] - time_s[last_load_row] > STEADY_S
+            is_end |= (cycle[load_rows[load_count : load_count + 1]] != cycle[last_load_row]).any()
         is_end &= drawn_C > 0.0
-        found.append(_Charge(start, end, bool(is_end), bool(not is_end and returned_C < drawn_C)))
-        lowest_C = passed_C[start] if is_end else lowest_C
-        if passed_C[end - 1] < lowest_C:
-            lowest_C = highest_C = passed_C[end - 1]
-    return found
+        charges.append(_Charge(start, end, bool(is_end), bool(not is_end and returned_C < drawn_C)))
+        lowest_C = net_C[start] if is_end else lowest_C
+        if net_C[end - 1] < lowest_C:
+            lowest_C = highest_C = net_C[end - 1]
+    return charges
 
 
-def _charge_before(rows: pd.DataFrame, part: slice) -> ChargeBefore | None:
-    """The charge that ends where a discharge begins, if it is in the table and no mere noise."""
-    time_s, voltage_V, current_A = (rows[each].to_numpy()[part] for each in ("time", "voltage", "current"))
+def _charge_before(rows: pd.DataFrame, charge_rows: slice) -> ChargeBefore | None:
+    """Return the charge that ends at the start of a discharge, if it is in the table and not noise."""
+    time_s, voltage_V, current_A = (rows[name].to_numpy()[charge_rows] for name in ("time", "voltage", "current"))
     is_noise = not (current_A < -LEAST_LOAD_SHARE * rows["current"].abs().max()).any()
     return None if is_noise else ChargeBefore.of(time_s, voltage_V, current_A)
 
@@ -311,10 +315,10 @@ def _recording(
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     if "cycle" in rows:
         meta["cycle"] = int(rows["cycle"].iloc[int(is_load(current_A).argmax())])
-    # dates of this century are more than a billion seconds after 1970, and a clock is none
+    # dates of this century are more than a billion seconds after 1970, unlike a clock
     if "date" in rows and rows["date"].iloc[0] > 1e9:
-        begin = datetime.fromtimestamp(float(rows["date"].iloc[0]), tz=timezone.utc)
-        meta["start_time"] = begin.replace(tzinfo=None).isoformat(timespec="milliseconds")
+        start = datetime.fromtimestamp(float(rows["date"].iloc[0]), tz=timezone.utc)
+        meta["start_time"] = start.replace(tzinfo=None).isoformat(timespec="milliseconds")
     if "ambient" in rows and not rows["ambient"].isna().all():
         meta["ambient_temperature_C"] = float(rows["ambient"].median())
     arrays = {
@@ -330,18 +334,19 @@ def _recording(
 
 
 def _with_count(history: ChargeHistory, rows: pd.DataFrame, origin: Origin) -> ChargeHistory:
-    """With how much the charge under load is another one than the tester counted row by row; it may count anew with a step."""
+    """Add the difference between the charge under load and the tester's count, which may restart with a step."""
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
-    loaded = np.flatnonzero(is_load(current_A))
-    part = slice(loaded[0], loaded[-1] + 1)
-    step_C, passed_C = np.diff(rows["capacity"].to_numpy()[part]), np.diff(integrate_load(time_s, current_A, time_s)[part])
-    if len(loaded) < LEAST_SAMPLES or (step_C > 0.0).mean() < 0.5:
+    load_rows = np.flatnonzero(is_load(current_A))
+    span = slice(load_rows[0], load_rows[-1] + 1)
+    step_C = np.diff(rows["capacity"].to_numpy()[span])
+    integral_C = np.diff(integrate_load(time_s, current_A, time_s)[span])
+    if len(load_rows) < LEAST_SAMPLES or (step_C > 0.0).mean() < 0.5:
         return history
-    goes_on = (step_C >= 0.0) & (passed_C >= 0.0) & (np.abs(np.diff(current_A[part])) <= SWITCH_SHARE * current_A.max())
-    counted_Ah, passed_Ah = step_C[goes_on].sum() / 3600.0, passed_C[goes_on].sum() / 3600.0
-    if abs(passed_Ah - counted_Ah) > FEW_SHARE * counted_Ah:
-        told = f"the tester counted {counted_Ah:.4g} Ah, where current and time make {passed_Ah:.4g} Ah"
+    is_steady = (step_C >= 0.0) & (integral_C >= 0.0) & (np.abs(np.diff(current_A[span])) <= SWITCH_SHARE * current_A.max())
+    counter_Ah, integral_Ah = step_C[is_steady].sum() / 3600.0, integral_C[is_steady].sum() / 3600.0
+    if abs(integral_Ah - counter_Ah) > FEW_SHARE * counter_Ah:
+        problem = f"the tester counted {counter_Ah:.4g} Ah, where current and time make {integral_Ah:.4g} Ah"
         if origin.leaves_open("time"):
-            refuse_other_unit(counted_Ah, passed_Ah, told)
-        say(f"{told}: check units and clock, and that all rows are there")
-    return history._replace(is_counted=bool((step_C >= 0.0).all()), sd_counter_C=3600.0 * abs(passed_Ah - counted_Ah))
+            refuse_other_unit(counter_Ah, integral_Ah, problem)
+        notify(f"{problem}: check units and clock, and that all rows are there")
+    return history._replace(is_counted=bool((step_C >= 0.0).all()), sd_counter_C=3600.0 * abs(integral_Ah - counter_Ah))

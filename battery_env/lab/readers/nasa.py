@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 
 from battery_env.arrays import FloatArray
-from battery_env.files import call_alone
+from battery_env.files import call_in_process
 from battery_env.records.discharge import NASA_CITATION
 
 
 def read_nasa_mat(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """The discharges of one of NASA's own files before they are checked."""
+    """Return the unchecked discharges of one of NASA's own files."""
     content: dict[str, Any] = {}
     try:
-        content = call_alone("scipy.io", "loadmat", str(path), simplify_cells=True)
+        content = call_in_process("scipy.io", "loadmat", str(path), simplify_cells=True)
         ((cell, value),) = ((name, value) for name, value in content.items() if isinstance(value, dict) and "cycle" in value)
         return _samples_of_mat(cell, value)
-    except Exception as error:  # scipy raises whatever the damage leads it to, and a field may be missing anywhere
+    except Exception as error:  # scipy raises errors of many types, and any field may be missing
         names = ", ".join(name for name in content if not name.startswith("__"))
-        where = f"one of its variables ({names}) must be a cell with its cycles" if content else error
-        raise ValueError(f"the file is damaged, or not laid out as NASA's battery files: {where}") from error
+        problem = f"one of its variables ({names}) must be a cell with its cycles" if content else error
+        raise ValueError(f"the file is damaged, or not laid out as NASA's battery files: {problem}") from error
 
 
 def _samples_of_mat(cell: str, value: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
@@ -44,8 +44,8 @@ def _samples_of_mat(cell: str, value: dict[str, Any]) -> list[tuple[dict[str, An
         if np.size(data.get("Capacity", [])) == 1:
             meta["capacity_Ah"] = float(data["Capacity"])
         if impedances:
-            nearest = min(impedances, key=lambda entry: abs(entry[0] - start))[1]
-            meta.update(Re_ohm=float(np.real(nearest["Re"])), Rct_ohm=float(np.real(nearest["Rct"])))
+            impedance = min(impedances, key=lambda entry: abs(entry[0] - start))[1]
+            meta.update(Re_ohm=float(np.real(impedance["Re"])), Rct_ohm=float(np.real(impedance["Rct"])))
         arrays = {
             "time_s": data["Time"],
             "voltage_V": data["Voltage_measured"],

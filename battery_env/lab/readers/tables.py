@@ -20,43 +20,43 @@ import numpy as np
 import pandas as pd
 
 from battery_env.files import LARGEST_UNPACKED_BYTES, kind_of
-from battery_env.lab.readers.columns import FileFormat, Recognised, are_units, count_required, say
+from battery_env.lab.readers.columns import FileFormat, TableHeader, are_units, count_required, notify
 from battery_env.lab.readers.testers import ENCODINGS, REQUIRED
 from battery_env.records.refusals import Advice, RecordError
 
 Key = TypeVar("Key")
 
-#: Endings of the names of files that can be read, besides those of NASA (.mat); of text also packed (.gz, .zip). Text of
-#: Maccor's is numbered, and some call theirs .xls.
+#: Suffixes of readable files, besides NASA's .mat; packed text (.gz, .zip) is readable too. Maccor's text has numbered
+#: suffixes, and some testers name text .xls.
 TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".mpt", ".dta", ".bdf", ".xls")
 NUMBERED_SUFFIXES = tuple(f".{number:03d}" for number in range(1000))
 BINARY_SUFFIXES = (".parquet", ".nda", ".ndax", ".mpr", ".xlsx")
 PACKED_SUFFIXES = (".gz", ".zip")
 
-# Testers write what they know about a test above the table: its header is searched in so many lines of so many bytes each. A
-# table is known by so many of its rows.
+# Testers write notes on a test above its table: limits of the search for the header, in lines, and in bytes a line. Number of
+# first rows that identify a table.
 _HEAD_LINES, _LINE_BYTES, _FIRST_ROWS = 2000, 128, 400
-# A small file has no more rows and columns, so that all that is made of it fits into 1 GB; a large one a row each 20 bytes.
+# Limits that keep the memory below 1 GB: rows, or in a large file least bytes a row, and columns.
 _MOST_ROWS, _LEAST_ROW_BYTES, _MOST_COLUMNS = 3_000_000, 20, 2000
 _BLANKS = r"\s+"
 _DELIMITERS = (",", ";", "\t", "|", _BLANKS)
 _NUMBER = re.compile(r"[-+]?[\d.,]*\d[.,]?(?:[eE][-+]?\d+)?$")
-_ITS_COMMA = re.compile(r"^(\s*[-+]?\d*),(?=\d)")
+_DECIMAL_COMMA = re.compile(r"^(\s*[-+]?\d*),(?=\d)")
 
 
 class TooLargeError(ValueError):
-    """A file, or what is packed in it, is beyond a bound."""
+    """A file, or its unpacked content, exceeds a limit."""
 
 
-class Opened(NamedTuple):
-    """A table of which the header and the first rows are read."""
+class OpenTable(NamedTuple):
+    """A table whose header and first rows are read."""
 
     names: list[str]
     rows: list[list[str]]
-    read: Callable[[Recognised], pd.DataFrame]  # the columns of a record, by quantity, and no others
+    read: Callable[[TableHeader], pd.DataFrame]  # reads the recognised columns, by quantity
 
 
-def open_file(path: Path, file_format: FileFormat) -> Opened:
+def open_file(path: Path, file_format: FileFormat) -> OpenTable:
     """Read the beginning of a file."""
     suffix = path.suffix.lower()
     if suffix in (".ndax", ".xlsx"):
@@ -70,21 +70,21 @@ def open_file(path: Path, file_format: FileFormat) -> Opened:
     return _open_text(_text_of(path), file_format)
 
 
-def open_frame(table: pd.DataFrame) -> Opened:
-    """A table that is there; an index with a name is a column too."""
+def open_frame(table: pd.DataFrame) -> OpenTable:
+    """Return a DataFrame as a table; an index with a name is a column too."""
     table = table.reset_index(drop=table.index.names == [None])
 
-    def read(found: Recognised) -> pd.DataFrame:
-        return pd.DataFrame({key: table.iloc[:, column.position] for key, column in found.columns.items()})
+    def read(header: TableHeader) -> pd.DataFrame:
+        return pd.DataFrame({key: table.iloc[:, column.position] for key, column in header.columns.items()})
 
-    first = table.head(_FIRST_ROWS).astype(object)
-    rows = [[str(value) for value in row] for row in first.where(first.notna(), "").to_numpy()]
-    return Opened([str(name) for name in table.columns], rows, read)
+    beginning = table.head(_FIRST_ROWS).astype(object)
+    rows = [[str(value) for value in row] for row in beginning.where(beginning.notna(), "").to_numpy()]
+    return OpenTable([str(name) for name in table.columns], rows, read)
 
 
-def _check(count: int, most: int, what: str) -> None:
-    if count > most:
-        raise TooLargeError(f"{count} {what} are more than the {most} that are read: cut it in parts, or unpack it by hand")
+def _check(count: int, limit: int, unit: str) -> None:
+    if count > limit:
+        raise TooLargeError(f"{count} {unit} are more than the {limit} that are read: cut it in parts, or unpack it by hand")
 
 
 def _check_rows(count: int, size: int) -> None:
@@ -96,17 +96,17 @@ def _check_unpacked(count: int) -> None:
 
 
 def _content(path: Path) -> bytes:
-    """The content of a file, unpacked."""
-    parts, count, lines = [], 0, 0
+    """Return the unpacked content of a file."""
+    chunks, count, lines = [], 0, 0
     with _reading("packed text"), _open(path) as stream:
-        while part := stream.read(1 << 20):
-            parts.append(part)
-            count += len(part)
-            lines += max(part.count(b"\n"), part.count(b"\r"))  # as on old computers, too
+        while chunk := stream.read(1 << 20):
+            chunks.append(chunk)
+            count += len(chunk)
+            lines += max(chunk.count(b"\n"), chunk.count(b"\r"))  # old computers end lines with \r
             _check_rows(lines, count)
             if path.suffix.lower() in PACKED_SUFFIXES:
                 _check_unpacked(count)
-    return b"".join(parts)
+    return b"".join(chunks)
 
 
 def _open(path: Path) -> IO[bytes]:
@@ -120,16 +120,16 @@ def _open(path: Path) -> IO[bytes]:
 
 
 def _check_archive(path: Path) -> None:
-    """Refuse a file that holds an archive of what is far larger, by what the archive says of itself."""
+    """Refuse an archive with a far larger content, by the sizes in its directory."""
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            # of a text that many cells share each is kept
-            sizes = [each.file_size * (8 if "sharedStrings" in each.filename else 1) for each in archive.infolist()]
+            # each cell keeps a copy of a shared text
+            sizes = [entry.file_size * (8 if "sharedStrings" in entry.filename else 1) for entry in archive.infolist()]
         _check_unpacked(sum(sizes))
 
 
 def check_mat(path: Path) -> None:
-    """Refuse a MATLAB file whose packed variables become far larger, before they are read."""
+    """Refuse a MATLAB file whose packed variables are far larger, before reading them."""
     count = 0
     with path.open("rb") as stream:
         stream.seek(128)
@@ -137,48 +137,48 @@ def check_mat(path: Path) -> None:
             kind, size = np.frombuffer(tag, dtype="<u4").tolist()
             end = stream.tell() + size
             unpacker = zlib.decompressobj()
-            while kind == 15 and stream.tell() < end and (part := stream.read(min(1 << 14, end - stream.tell()))):
+            while kind == 15 and stream.tell() < end and (chunk := stream.read(min(1 << 14, end - stream.tell()))):
                 try:
-                    count += len(unpacker.decompress(part))
+                    count += len(unpacker.decompress(chunk))
                 except zlib.error:
-                    return  # which what reads it says
-                _check_unpacked(8 * count)  # numbers may be written in one byte that take eight in memory
+                    return  # the reader refuses it
+                _check_unpacked(8 * count)  # a number of one byte takes eight in memory
             stream.seek(end)
 
 
 def _text_of(path: Path) -> bytes:
-    """The text of a file without what is no character."""
+    """Return the text of a file without bytes that are no characters."""
     content = _content(path)
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         content = content.decode("utf-16", errors="ignore").encode()
-    kept = content.rstrip(b"\0")  # what a power cut leaves of the end
-    if kind := kind_of(content) or "binary" * (10 * kept.count(b"\0") > len(kept)):
+    text = content.rstrip(b"\0")  # a power cut may leave NUL bytes at the end
+    if kind := kind_of(content) or "binary" * (10 * text.count(b"\0") > len(text)):
         raise RecordError(f"the file is {kind}, and no table", [Advice("Export the records as CSV, a workbook as .xlsx")])
-    kept = kept.replace(b"\0", b"")
-    if len(kept) < len(content):
-        say(f"{len(content) - len(kept)} NUL bytes, which are no text, are left out")
-    return kept.replace("\u2212".encode(), b"-")  # the sign of typographers
+    text = text.replace(b"\0", b"")
+    if len(text) < len(content):
+        notify(f"{len(content) - len(text)} NUL bytes, which are no text, are left out")
+    return text.replace("\u2212".encode(), b"-")  # the typographic minus sign
 
 
-def _open_text(content: bytes, file_format: FileFormat) -> Opened:
-    """In UTF-8, or in the encoding in which the beginning of the text has the names of a record."""
-    stated = file_format.tester and file_format.tester.encoding
+def _open_text(content: bytes, file_format: FileFormat) -> OpenTable:
+    """Read text in UTF-8, or in the encoding in which its beginning has the names of a record."""
+    stated_encoding = file_format.tester and file_format.tester.encoding
     tables: dict[tuple[str, str], list[list[str]]] = {}
-    for encoding in [stated] if stated else ["utf-8", *ENCODINGS]:
+    for encoding in [stated_encoding] if stated_encoding else ["utf-8", *ENCODINGS]:
         try:
-            # the head may end within a character
+            # the head may cut a character
             head = getincrementaldecoder(encoding)().decode(content[: _HEAD_LINES * _LINE_BYTES], final=False)
         except (LookupError, UnicodeDecodeError) as error:
-            if stated:
-                raise ValueError(f"the file is no text in {stated}: {error}") from error
+            if stated_encoding:
+                raise ValueError(f"the file is no text in {stated_encoding}: {error}") from error
             continue
         lines = io.StringIO(head.removeprefix("\ufeff"), newline=None).read().split("\n")[: _HEAD_LINES + _FIRST_ROWS]
         tables |= {(encoding, delimiter): [_fields(line, delimiter) for line in lines] for delimiter in _DELIMITERS}
         if encoding == "utf-8":
             break
     (encoding, delimiter), number, names = _find_header(tables, file_format)
-    below = tables[encoding, delimiter][number + 1 : number + 1 + _FIRST_ROWS]
-    rows = [*map(_filled, below)]
+    lines_below = tables[encoding, delimiter][number + 1 : number + 1 + _FIRST_ROWS]
+    rows = [*map(_strip_empty, lines_below)]
     _check(len(names), _MOST_COLUMNS, "columns")
     has_units = bool(rows) and are_units(rows[0])
     values = [row for row in rows[has_units:] if row]
@@ -187,15 +187,15 @@ def _open_text(content: bytes, file_format: FileFormat) -> Opened:
     if not names[0] and 0 < 2 * sum(row[0] != "" for row in values) < len(values):
         raise ValueError("rows of cycles, steps and records are in one table: export the records alone")
     # a name may hold blanks
-    odd = [len(row) for row in values if len(row) > len(names) or (len(row) < len(names) and delimiter == _BLANKS)]
-    if 2 * len(odd) > len(values):
+    widths = [len(row) for row in values if len(row) > len(names) or (len(row) < len(names) and delimiter == _BLANKS)]
+    if 2 * len(widths) > len(values):
         raise ValueError(
-            f"rows have {odd[0]} fields below {len(names)} names, which does not tell what is what: name each column, and "
+            f"rows have {widths[0]} fields below {len(names)} names, which does not tell what is what: name each column, and "
             "take another delimiter than the decimal comma, or than the blanks in names"
         )
-    width = max(map(len, below[has_units:]))
+    width = max(map(len, lines_below[has_units:]))
     if names[width:]:
-        say(f"the header is longer than the rows: {', '.join(names[width:])} left out")
+        notify(f"the header is longer than the rows: {', '.join(names[width:])} left out")
     numbers = [field for row in values for field in row if _NUMBER.match(field)]
     options: dict[str, Any] = {
         "sep": delimiter,
@@ -204,66 +204,66 @@ def _open_text(content: bytes, file_format: FileFormat) -> Opened:
         "skiprows": number + 1 + has_units,
         "names": range(width),
     }
-    return Opened(names[:width], rows, lambda found: _read_text(content, options, found))
+    return OpenTable(names[:width], rows, lambda header: _read_text(content, options, header))
 
 
-def _read_text(content: bytes, options: dict[str, Any], found: Recognised) -> pd.DataFrame:
-    positions = sorted({column.position for column in found.columns.values()})  # one may serve as two quantities
+def _read_text(content: bytes, options: dict[str, Any], header: TableHeader) -> pd.DataFrame:
+    positions = sorted({column.position for column in header.columns.values()})  # one column may serve two quantities
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of columns that are text in parts, which is seen later
+            warnings.simplefilter("ignore")  # pandas warns of columns that are partly text, which is checked later
             table = pd.read_csv(
                 io.BytesIO(content),
-                encoding_errors="replace",  # of remarks; what is no number is seen later
+                encoding_errors="replace",  # in remarks; numbers are checked later
                 header=None,
                 usecols=[n for n in positions if n in options["names"]],
                 index_col=False,
-                na_values=[*found.tester.missing],
+                na_values=[*header.tester.missing],
                 **options,
             )
-    except Exception as error:  # pandas raises whatever the damage leads it to
+    except Exception as error:  # pandas raises errors of many types
         raise RecordError(f"the file is damaged, or no table: {str(error).strip()}") from error
     table = table.reindex(columns=positions)
-    if options["decimal"] == ",":  # words among numbers make text of all
-        table = table.replace(_ITS_COMMA, r"\1.", regex=True)
-    return pd.DataFrame({key: table[column.position] for key, column in found.columns.items()})
+    if options["decimal"] == ",":  # a column with words is text
+        table = table.replace(_DECIMAL_COMMA, r"\1.", regex=True)
+    return pd.DataFrame({key: table[column.position] for key, column in header.columns.items()})
 
 
 def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: FileFormat) -> tuple[Key, int, list[str]]:
     """
-    In which of some tables, by delimiter or by sheet, and in which of its rows the names of the columns are: above rows of
-    numbers in as many fields, or in fewer below names of a whole record, those of most quantities. Where there are none the
-    row is that above the numbers, and the names are places.
+    Find the names of the columns: return their table, by delimiter or by sheet, their row, and the names. The header is above
+    rows of numbers in equally many fields, or, if it names a whole record, in fewer fields, and names most quantities. Without
+    a header the row is the one above the numbers, and the names are numbers of columns.
     """
-    candidates: dict[tuple[str, ...], tuple[bool, int, int, int, Key]] = {}  # by names, which may come again
-    most, first, of_most = 0, 0, next(iter(tables))  # numbers in rows of them, the first of these rows, and their table
+    candidates: dict[tuple[str, ...], tuple[bool, int, int, int, Key]] = {}  # by names, which may repeat
+    largest_count, first, number_table = 0, 0, next(iter(tables))
     for key, rows in tables.items():
         counts = np.array([sum(bool(_NUMBER.match(field)) for field in row) for row in rows], dtype=np.int64)
         are_numbers = counts > 1
-        # a delimiter may end each
-        widths = np.array([(len(row), len(_filled(row))) for row in rows]).reshape(-1, 2)
-        if (count := int(counts[are_numbers].sum())) > most:
-            usual = np.bincount(widths[are_numbers, 1]).argmax()  # a title may hold numbers, too
-            most, first, of_most = count, int((are_numbers & (widths[:, 1] == usual)).argmax()), key
+        # each row may end with a delimiter
+        widths = np.array([(len(row), len(_strip_empty(row))) for row in rows]).reshape(-1, 2)
+        if (count := int(counts[are_numbers].sum())) > largest_count:
+            usual_width = np.bincount(widths[are_numbers, 1]).argmax()  # a title may hold numbers, too
+            largest_count, first, number_table = count, int((are_numbers & (widths[:, 1] == usual_width)).argmax()), key
         for n, row in enumerate(rows[:_HEAD_LINES]):
             if any(row) and not counts[n]:
                 below, quantities = slice(n + 1, n + 1 + _FIRST_ROWS), count_required(row, file_format)
-                fits = int(((widths[below] == widths[n]).any(axis=1) & are_numbers[below]).sum())
+                fit_count = int(((widths[below] == widths[n]).any(axis=1) & are_numbers[below]).sum())
                 is_longer = quantities == len(REQUIRED) and bool((widths[below] < widths[n]).all(axis=1) @ are_numbers[below])
-                candidates.setdefault(tuple(_filled(row)), (fits > 0 or is_longer, quantities, fits, n, key))
-    if not candidates and not most:
+                candidates.setdefault(tuple(_strip_empty(row)), (fit_count > 0 or is_longer, quantities, fit_count, n, key))
+    if not candidates and not largest_count:
         raise ValueError("the file is empty")
-    best = max(candidates.values(), key=lambda each: each[:4], default=(False, 0, 0, 0, of_most))
+    best = max(candidates.values(), key=lambda candidate: candidate[:4], default=(False, 0, 0, 0, number_table))
     is_header, quantities, _, number, key = best
-    if most and not is_header and quantities < len(REQUIRED):
+    if largest_count and not is_header and quantities < len(REQUIRED):
         if not (file_format.columns or file_format.tester):
-            say("no line names the columns: state places, --columns time=1,voltage=2,current=3 (and --units current=0.01A)")
-        width = max(len(_filled(row)) for row in tables[of_most][first:])
-        return of_most, first - 1, [str(n + 1) for n in range(width)]
-    first = next(each[3] for each in candidates.values() if each[:2] == best[:2])
+            notify("no line names the columns: state places, --columns time=1,voltage=2,current=3 (and --units current=0.01A)")
+        width = max(len(_strip_empty(row)) for row in tables[number_table][first:])
+        return number_table, first - 1, [str(n + 1) for n in range(width)]
+    first = next(candidate[3] for candidate in candidates.values() if candidate[:2] == best[:2])
     if quantities and first != number:
-        say(f"the header is line {number + 1}; the table of line {first + 1} is left out")
-    return key, number, _filled(tables[key][number])
+        notify(f"the header is line {number + 1}; the table of line {first + 1} is left out")
+    return key, number, _strip_empty(tables[key][number])
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
@@ -275,15 +275,15 @@ def _fields(line: str, delimiter: str) -> list[str]:
     return [field.strip().strip('"') for field in fields]
 
 
-def _filled(fields: Sequence[str]) -> list[str]:
-    """Without what is empty at the end."""
-    most = max((n for n, field in enumerate(fields, start=1) if field), default=0)
-    return list(fields[:most])
+def _strip_empty(fields: Sequence[str]) -> list[str]:
+    """Return the fields without empty ones at the end."""
+    length = max((n for n, field in enumerate(fields, start=1) if field), default=0)
+    return list(fields[:length])
 
 
 @contextmanager
 def _reading(kind: str, extra: str = "") -> Iterator[None]:
-    """Of what others read: their own warnings are not passed on, and what is missing, or not as it should be, is named."""
+    """Run a reader of another package without its warnings, and name a missing extra or damage in its errors."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -292,42 +292,42 @@ def _reading(kind: str, extra: str = "") -> Iterator[None]:
         raise
     except ImportError as error:
         raise ImportError(f"{kind} files need an extra: pip install './battery_env[{extra}]' ({error})") from error
-    except Exception as error:  # whatever the damage leads to
+    except Exception as error:  # the packages raise errors of many types
         raise ValueError(f"the file is damaged, or no {kind} file: {str(error).strip() or type(error).__name__}") from error
 
 
 def _read_workbook(path: Path, file_format: FileFormat) -> pd.DataFrame:
-    """The sheet of a workbook that holds the record, and those that continue it."""
+    """Read the sheet of a workbook with the record, and the sheets that continue it."""
     with _reading("Excel", "excel"):
         import openpyxl
 
         with closing(openpyxl.load_workbook(path, read_only=True, data_only=True)) as book:
             for sheet in book.worksheets:
-                sheet.reset_dimensions()  # which a single cell in the last corner makes
+                sheet.reset_dimensions()  # a single cell in the last corner makes these huge
             sheets = {sheet.title: _rows_of_sheet(sheet.title, sheet.iter_rows(values_only=True)) for sheet in book.worksheets}
-    beginnings = {title: rows[: _HEAD_LINES + _FIRST_ROWS] for title, rows in sheets.items()}
-    title, line, header = _find_header(beginnings, file_format)
-    parts = [rows[rows.index(header) + 1 :] for rows in sheets.values() if header in rows[:_HEAD_LINES]]
-    parts, width = parts or [sheets[title][line + 1 :]], len(header)
-    return pd.DataFrame([[*row, *[""] * width][:width] for rows in parts for row in rows], columns=header)
+    heads = {title: rows[: _HEAD_LINES + _FIRST_ROWS] for title, rows in sheets.items()}
+    title, line, header = _find_header(heads, file_format)
+    tables = [rows[rows.index(header) + 1 :] for rows in sheets.values() if header in rows[:_HEAD_LINES]]
+    tables, width = tables or [sheets[title][line + 1 :]], len(header)
+    return pd.DataFrame([[*row, *[""] * width][:width] for rows in tables for row in rows], columns=header)
 
 
 def _rows_of_sheet(title: object, rows: Iterable[Sequence[Any]]) -> list[list[str]]:
-    """The rows of a sheet as far as they are filled; refused where it is too large."""
-    kept: list[list[str]] = []
+    """Return the filled fields of the rows of a sheet; refuse a sheet that is too large."""
+    filled_rows: list[list[str]] = []
     size = 0
     for row in rows:
-        fields = _filled(["" if value is None else " ".join(str(value).split()) for value in row])
+        fields = _strip_empty(["" if value is None else " ".join(str(value).split()) for value in row])
         _check(len(fields), _MOST_COLUMNS, f"columns in sheet {title!r}")
         if fields:
-            kept.append(fields)
-            size += sum(map(len, fields)) + 60 * len(fields)  # as Python keeps text
+            filled_rows.append(fields)
+            size += sum(map(len, fields)) + 60 * len(fields)  # memory of Python's text
             _check_unpacked(size)
-    return kept
+    return filled_rows
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:
-    """A table whose footer says how large it is; text is kept once, however often it comes."""
+    """Read a table, after its footer has given its size; repeated text takes memory once."""
     with _reading("Parquet", "parquet"):
         from pyarrow import parquet, types
 
@@ -336,11 +336,11 @@ def _read_parquet(path: Path) -> pd.DataFrame:
         _check_rows(metadata.num_rows, path.stat().st_size)
         _check(metadata.num_rows * len(fields), max(LARGEST_UNPACKED_BYTES // 8, path.stat().st_size), "values")
         _check_unpacked(sum(metadata.row_group(n).total_byte_size for n in range(metadata.num_row_groups)))
-        counts = Counter(each.name for each in fields)  # of a name that comes twice nothing tells which is meant
-        names = [each.name for each in fields if counts[each.name] == 1 and not types.is_nested(each.type)]
-        text = [each.name for each in fields if types.is_string(each.type) or types.is_large_string(each.type)]
-        # the metadata of pandas would make an index of a column
-        return parquet.read_table(path, columns=names, read_dictionary=text).to_pandas(ignore_metadata=True)
+        counts = Counter(field.name for field in fields)  # a repeated name is ambiguous
+        names = [field.name for field in fields if counts[field.name] == 1 and not types.is_nested(field.type)]
+        text_names = [field.name for field in fields if types.is_string(field.type) or types.is_large_string(field.type)]
+        # the metadata of pandas would turn a column into an index
+        return parquet.read_table(path, columns=names, read_dictionary=text_names).to_pandas(ignore_metadata=True)
 
 
 def _read_neware(path: Path) -> pd.DataFrame:
@@ -357,9 +357,9 @@ def _read_biologic(path: Path) -> pd.DataFrame:
         return pd.DataFrame(MPRfile(stream).data)
 
 
-def is_readable(path: Path, more: Sequence[str] = ()) -> bool:
-    """Whether the name of a file ends as that of a record may."""
+def is_readable(path: Path, further_suffixes: Sequence[str] = ()) -> bool:
+    """Whether a file has the suffix of a record."""
     suffixes = [suffix.lower() for suffix in path.suffixes]
     if suffixes and suffixes[-1] in PACKED_SUFFIXES:
         return len(suffixes) > 1 and suffixes[-2] in TEXT_SUFFIXES
-    return bool(suffixes) and suffixes[-1] in (*TEXT_SUFFIXES, *NUMBERED_SUFFIXES, *BINARY_SUFFIXES, *more)
+    return bool(suffixes) and suffixes[-1] in (*TEXT_SUFFIXES, *NUMBERED_SUFFIXES, *BINARY_SUFFIXES, *further_suffixes)

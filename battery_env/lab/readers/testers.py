@@ -1,4 +1,4 @@
-"""The testers whose files are known: a row each, of what it calls its columns and how it counts. Users add rows as files."""
+"""The known testers: a row each, with its names of columns and its sign of the current. Users add rows as files."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-# Words end at a capital, too, as in TestTime; a word of a sentence, with a mark at its end, is no name.
+# A word also ends at a capital, as in TestTime; a word with a punctuation mark at its end is no name.
 _GAP = re.compile(r"(?<=[a-zäöü]{2})(?=[A-ZÄÖÜ])|(?:[_\-\s.#<>~{}()\[\]/]|[,:](?=.)|(?<=[_\s])in(?=[_\s]))+")
-# Text of TOML, whose basic strings are those of JSON.
+# Basic strings of TOML are those of JSON.
 _quoted = partial(json.dumps, ensure_ascii=False)
-#: So long are names, and what is shown of a line.
+#: Largest length of a name, and of a line in a message.
 LONGEST = 200
-#: What a column may hold, and what a record must have.
+#: Quantities of columns, and those that a record needs.
 QUANTITIES = tuple(
     "time date voltage counter current power charge_step temperature ambient capacity cycle step cell state".split()
 )
 REQUIRED = ("time", "voltage", "current")
-#: What may stand in the place of a quantity that a record must have.
-INSTEAD = {"time": ("date",), "current": ("power", "charge_step")}
+#: Quantities that can replace a required quantity.
+SUBSTITUTES = {"time": ("date",), "current": ("power", "charge_step")}
 
 
 @dataclass(frozen=True)
 class Tester:
     """
-    How a tester writes its tables.
+    The layout of a tester's tables.
 
-    :param name: what it is called
-    :param columns: by quantity, the names of its column without units, the first that a table has is taken. Capitals, blanks
-        and signs do not count. ``time`` runs through the test; ``counter`` is an electrode against which the voltage is
-        measured, ``charge_step`` the charge since the row before, and ``capacity`` the tester's own count of what is drawn
-    :param told_by: names of which a table of this tester has one
-    :param units: by quantity, its unit where the name in the table says none; else s, V, A, degC and Ah
-    :param discharge_is_negative: how the current of a discharge is counted, where voltage and words do not tell
-    :param encoding: of its text, where that is not UTF-8
-    :param missing: what it writes for a value that was not measured, besides nothing and NaN
-    :param argument: the file that it is from
+    :param name: name of the tester
+    :param columns: names of columns without units, by quantity; the first name in a table counts. Capitals, blanks and signs
+        do not count. ``time`` runs through the test; ``counter`` is the counter electrode of the voltage, ``charge_step`` the
+        charge since the previous row, and ``capacity`` the tester's count of the charge drawn
+    :param marks: names that identify a table of this tester
+    :param units: units of names without a unit, by quantity; else s, V, A, degC and Ah
+    :param discharge_is_negative: whether the current of a discharge is negative, if voltage and words do not decide
+    :param encoding: of its text, if not UTF-8
+    :param missing: text for a missing value, besides nothing and NaN
+    :param argument: the file of this row
     """
 
     name: str
     columns: Mapping[str, Sequence[str]]
-    told_by: Sequence[str] = ()
+    marks: Sequence[str] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     discharge_is_negative: bool | None = None
     encoding: str = ""
@@ -63,25 +63,25 @@ class Tester:
 
     @cached_property
     def ranks(self) -> dict[str, dict[str, int]]:
-        """By the words of a name, the quantities that it may be, and its rank among their names."""
-        found: dict[str, dict[str, int]] = {}
+        """Quantities by the words of a name, with the rank of the name for each."""
+        ranks: dict[str, dict[str, int]] = {}
         for quantity, names in self.columns.items():
             for rank, name in enumerate(names):
-                found.setdefault("".join(words_of(name)), {}).setdefault(quantity, rank)
-        return found
+                ranks.setdefault("".join(words_of(name)), {}).setdefault(quantity, rank)
+        return ranks
 
 
-def _row(name: str, told_by: str, negative: bool | None = None, encoding: str = "", missing: str = "", **names: str) -> Tester:
-    columns = {quantity: _listed(text) for quantity, text in names.items()}
-    return Tester(name, columns, _listed(told_by), {}, negative, encoding, _listed(missing))
+def _row(name: str, marks: str, negative: bool | None = None, encoding: str = "", missing: str = "", **names: str) -> Tester:
+    columns = {quantity: _split_names(text) for quantity, text in names.items()}
+    return Tester(name, columns, _split_names(marks), {}, negative, encoding, _split_names(missing))
 
 
-def _listed(text: str) -> list[str]:
+def _split_names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-# Names that are plain, too, are only in the row of these, but for clocks, of which that of the test comes first.
-_KNOWN = (
+# These rows omit names of the plain row, except clocks, because the clock of the test must come first.
+_NAMED_TESTERS = (
     _row(
         "Arbin", "dV/dt, Is_FC_Data, ACI_Phase_Angle", negative=True, time="Test_Time", date="Date_Time",
         temperature="Aux_Temperature_1, Aux_Temperature", cell="Channel_ID",
@@ -157,38 +157,38 @@ _PLAIN = _row(
 
 
 def words_of(name: str) -> list[str]:
-    """The words of a name in small letters; brackets may be as wide as a Chinese character."""
+    """Return the words of a name in small letters, with full-width brackets as plain brackets."""
     return _GAP.sub(" ", normalize("NFKC", name)[:LONGEST]).lower().split()
 
 
-def joined(first: Tester, *others: Tester) -> Tester:
-    """A row that knows the names of others behind its own."""
+def merge(first: Tester, *fallbacks: Tester) -> Tester:
+    """Return a row with the names of other rows behind the names of the first."""
     columns = {
-        quantity: list(dict.fromkeys(name for each in (first, *others) for name in each.columns.get(quantity, ())))
+        quantity: list(dict.fromkeys(name for tester in (first, *fallbacks) for name in tester.columns.get(quantity, ())))
         for quantity in QUANTITIES
     }
-    return replace(first, columns=columns, missing=[*first.missing, *(text for each in others for text in each.missing)])
+    return replace(first, columns=columns, missing=[text for tester in (first, *fallbacks) for text in tester.missing])
 
 
-#: The rows, in the order in which they are tried; the last one knows the names of all.
-TESTERS = (*_KNOWN, joined(_PLAIN, *_KNOWN))
-#: How text is encoded that is not UTF-8.
-ENCODINGS = tuple(dict.fromkeys(each.encoding for each in (_PLAIN, *_KNOWN) if each.encoding))
+#: All rows in order of trial; the last row has the names of all.
+TESTERS = (*_NAMED_TESTERS, merge(_PLAIN, *_NAMED_TESTERS))
+#: Encodings other than UTF-8.
+ENCODINGS = tuple(dict.fromkeys(tester.encoding for tester in (_PLAIN, *_NAMED_TESTERS) if tester.encoding))
 
 
 def find_tester(name: str | Path | Tester | None) -> Tester | None:
-    """A tester by its name, or from a file in TOML as :func:`tester_file` writes it; ``None``: it is told from the table."""
+    """Return a tester by its name, or from a TOML file as of :func:`tester_file`; ``None``: by the table."""
     if name is None or isinstance(name, Tester):
         return name
     for tester in TESTERS:
         if tester.name.lower() == str(name).strip().lower():
-            return joined(tester, TESTERS[-1])
+            return merge(tester, TESTERS[-1])
     try:
         tester = _tester_of(Path(name).stem, tomllib.loads(Path(name).read_text(encoding="utf-8")))
         return replace(tester, argument=str(name))
     except FileNotFoundError as error:
-        known = ", ".join(tester.name for tester in TESTERS)
-        raise FileNotFoundError(f"no file {str(name)!r}, nor a tester of this name: known are {known}") from error
+        names = ", ".join(tester.name for tester in TESTERS)
+        raise FileNotFoundError(f"no file {str(name)!r}, nor a tester of this name: known are {names}") from error
     except ValueError as error:  # of the encoding, of TOML, or of what it says
         raise ValueError(f"{name} is no file of a tester in TOML: {error}") from error
 
@@ -197,18 +197,18 @@ def _tester_of(name: str, content: dict[str, Any]) -> Tester:
     kinds = dict(name=str, columns=dict, units=dict, discharge_is_negative=bool, encoding=str, missing=list)
     for key, value in content.items():
         if key not in kinds or not isinstance(value, kinds[key]):
-            known = ", ".join(f"{name} ({kind.__name__})" for name, kind in kinds.items())
-            raise ValueError(f"a tester has {known}, got {key} = {value!r}")
+            allowed = ", ".join(f"{name} ({kind.__name__})" for name, kind in kinds.items())
+            raise ValueError(f"a tester has {allowed}, got {key} = {value!r}")
     columns, units = content.get("columns", {}), content.get("units", {})
     for key, value in (*columns.items(), *units.items()):
         if key not in QUANTITIES or not isinstance(value, str):
             raise ValueError(f"names and units are text by quantity ({', '.join(QUANTITIES)}), got {key} = {value!r}")
-    listed = {"columns": {quantity: [text] for quantity, text in columns.items()}}
-    return joined(Tester(**{"name": name} | content | listed), TESTERS[-1])
+    column_names = {"columns": {quantity: [text] for quantity, text in columns.items()}}
+    return merge(Tester(**{"name": name} | content | column_names), TESTERS[-1])
 
 
 def tester_file(columns: Mapping[str, Any], names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A file in TOML to fill in, with what was recognised of a table, by quantity, below its names and its first rows."""
+    """Return a TOML file to fill in, with the recognised columns of a table, its names and its first rows."""
     lines = [
         "# A tester for battery-calibrate --tester: its columns by name, and units that the names do not tell.",
         *(f"# {_quoted(', '.join(fields)[:200])}" for fields in (names, *rows[:2])),
