@@ -167,7 +167,12 @@ class Fit(NamedTuple):
 
 
 def calibrated(
-    discharge: Discharge, settings: Settings, load: LoadToCome | None = None, samples: int = 1000, end_is_asked: bool = False
+    discharge: Discharge,
+    settings: Settings,
+    load: LoadToCome | None = None,
+    samples: int = 1000,
+    end_is_asked: bool = False,
+    fixes_constants: bool = False,
 ) -> Calibration:
     """
     Calibrate one discharge, and predict the end of one in progress.
@@ -175,13 +180,14 @@ def calibrated(
     :param load: after the record; ``None``: as so far
     :param samples: number of samples of the forecast
     :param end_is_asked: whether an end that cannot be predicted is an error instead of an unknown
+    :param fixes_constants: see :func:`estimate`
     """
     loaded = cut(discharge, settings)
     for note in loaded.notes:
         warnings.warn(note, stacklevel=3)
     if end_is_asked and _is_below_all_sizes(loaded):
         raise ValueError(Reason.BELOW_ALL_SIZES.text)
-    fit, end = estimate(loaded), None
+    fit, end = estimate(loaded, fixes_constants), None
     for note in fit.notes:
         warnings.warn(note, stacklevel=3)
     sized = _of_its_size(fit.estimate, loaded)
@@ -254,8 +260,11 @@ def cut(discharge: Discharge, settings: Settings) -> LoadedPart:
     )
 
 
-def estimate(loaded: LoadedPart) -> Fit:
-    """Fit the model to a discharge by the method of its settings, and collect the evidence against that."""
+def estimate(loaded: LoadedPart, fixes_constants: bool = False) -> Fit:
+    """
+    Fit the model to a discharge by the method of its settings, and collect the evidence against that. Fixed constants carry
+    over with the parameters, but age: the resistance after ten seconds is always that of free ones.
+    """
     settings, record, start, cell = loaded.settings, loaded.record, loaded.start, loaded.cell
     resolved, thermal = settings.resolved, settings.resolved.thermal
     calibrator = settings.calibrator(cell, start, settings.usual_q_mobile_C if loaded.in_progress else None)
@@ -266,7 +275,11 @@ def estimate(loaded: LoadedPart) -> Fit:
         result = _SMALLEST
     else:
         # a temperature that the model holds is that of the settings, whatever was measured
-        result = calibrator.estimate(record if resolved.thermal else record.without_temperature())
+        fitted = record if resolved.thermal else record.without_temperature()
+        result = calibrator.estimate(fitted)
+        if fixes_constants:
+            fixed = replace(settings, cell_rates_sd={}).calibrator(cell, start)
+            result = _with_resistance_of(result, fixed.estimate(fitted))
     if doubts := start.findings or settings.other_load(mean_current_A(record)):
         # doubts about the charge leave the resistance settled, which may be off by 30 %
         result = replace(result, settled_q_mobile=False, findings=(*result.findings, *doubts))
@@ -338,6 +351,22 @@ def _is_below_all_sizes(loaded: LoadedPart) -> bool:
     model = RecordModel(loaded.cell, initial_soc=loaded.start.soc)
     voltage = model.forecast(loaded.record, _SMALLEST, cut_off_V=-np.inf, future_current_A=0.0)
     return bool(voltage.at_samples_V[-1] > loaded.record.voltage_V[-1])
+
+
+def _with_resistance_of(free: Estimate, fixed: Estimate) -> Estimate:
+    """Return the estimate with fixed constants, but for its resistance after ten seconds."""
+    name = "resistance_10s"
+    findings = [each for each in fixed.findings if each.number != name] + [
+        each for each in free.findings if each.number == name
+    ]
+    return replace(
+        fixed,
+        resistance_10s_ohm=free.resistance_10s_ohm,
+        sd_resistance_10s_ohm=free.sd_resistance_10s_ohm,
+        settled_resistance_10s=free.settled_resistance_10s,
+        settled=True,  # as both numbers are
+        findings=tuple(findings),
+    )
 
 
 def _in_units_of_the_sensor(result: Estimate, gain_sd: float) -> Estimate:

@@ -147,8 +147,14 @@ def forecast_end(
 def calibrate_running(
     discharge: Discharge, settings: Settings, load: LoadToCome | None = None, samples: int = 1000, life: Life | None = None
 ) -> Calibration:
-    """Calibrate a discharge in progress, with the earlier life of its cell, and forecast its end."""
-    return calibrated(discharge, _with_life(discharge, settings, load, life), load, samples, end_is_asked=True)
+    """Calibrate a discharge in progress, with the prior and the usual start of its earlier life, and forecast its end."""
+    if life is not None:
+        start = life.usual_start or settings.usual_start
+        settings = replace(settings, prior_q_mobile_C=life.prior_for(discharge, load), usual_start=start)
+    # constants without a stated uncertainty carry over from a life, or to another load
+    carries_over = settings.prior_q_mobile_C is not None and (life is not None or load is not None)
+    fixes_constants = carries_over and not settings.cell_rates_sd
+    return calibrated(discharge, settings, load, samples, end_is_asked=True, fixes_constants=fixes_constants)
 
 
 def read_load(path: str | Path) -> Load:
@@ -223,18 +229,6 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
     if not before:
         raise ValueError(f"{', '.join(arguments)}: no discharge before {running.argument}")
     return before
-
-
-def _with_life(running: Discharge, settings: Settings, load: LoadToCome | None, life: Life | None) -> Settings:
-    """
-    Settings with the prior and the start of a life. Constants without a stated uncertainty are fixed where they carry over:
-    from a life, or to another load.
-    """
-    if life is not None:
-        start = life.usual_start or settings.usual_start
-        settings = replace(settings, prior_q_mobile_C=life.prior_for(running, load), usual_start=start)
-    holds_constants = settings.prior_q_mobile_C is not None and (life is not None or load is not None)
-    return replace(settings, cell_rates_sd=settings.cell_rates_sd or {}) if holds_constants else settings
 
 
 def end_of_record(
