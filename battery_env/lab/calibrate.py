@@ -47,17 +47,17 @@ from battery_env.records import (
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel, VoltageForecast
 
-# A record of more samples than this is averaged over the time step of the model, or longer where it lasts longer than so many
-# steps: what lies between says nothing to the model.
+# A record of more samples than this is averaged over the time step of the model, or over longer steps if the record has more
+# than this many of them: the model has no use for samples in between.
 _MANY_SAMPLES = 100_000
 _MODEL_STEP_S = 1.0
-# What is drawn after the cut-off is worth a word if it is more than this share of what was drawn before.
+# A charge after the cut-off is a warning above this share of the charge before.
 _AFTER_SHARE = 0.2
-# So near to a bound, as a share of it, a search ended at it.
+# A search has ended at a bound if its result is within this share of the bound.
 _AT_BOUND = 1e-3
 # The smallest cell of the model, with a resistance that lets its voltage fall most.
 _SMALLEST = Estimate(min(Q_MOBILE.limits), max(R_O.limits), settled=False)
-# Nine of ten values of a normal distribution lie within so many standard deviations.
+# Half of the interval that holds 90 % of a normal distribution, in standard deviations.
 _BAND_SD = 1.645
 
 
@@ -89,8 +89,8 @@ def calibrate(
 
     .. code-block:: python
 
-      for found in battery_env.calibrate("life.csv", nominal_Ah=2.0):
-          print(found)
+      for calibration in battery_env.calibrate("life.csv", nominal_Ah=2.0):
+          print(calibration)
 
     The capacity is unknown if the start of a discharge is unknown or contradicted by the voltage before the load, if a sensor
     fails, or if no charge was drawn although the samples around say so. The model's surroundings and first temperature are
@@ -105,8 +105,8 @@ def calibrate(
     :raises ValueError: if no discharge can be used
     :raises TypeError: for an unknown option
     """
-    known = (SettingsOptions if isinstance(source, Discharge) else Options).__annotations__
-    check_options("calibrate", options, known)
+    names = (SettingsOptions if isinstance(source, Discharge) else Options).__annotations__
+    check_options("calibrate", options, names)
     of_file = {name: options.pop(name) for name in options.keys() - SettingsOptions.__annotations__.keys()}
     settings = (Settings() if settings is None else settings).but(**options)
     if isinstance(source, Discharge):
@@ -175,7 +175,12 @@ class Fit(NamedTuple):
 
 
 def calibrated(
-    discharge: Discharge, settings: Settings, load: LoadToCome | None = None, samples: int = 1000, end_is_asked: bool = False
+    discharge: Discharge,
+    settings: Settings,
+    load: LoadToCome | None = None,
+    samples: int = 1000,
+    end_is_asked: bool = False,
+    fixes_constants: bool = False,
 ) -> Calibration:
     """
     Calibrate one discharge, and predict the end of one in progress.
@@ -183,13 +188,14 @@ def calibrated(
     :param load: after the record; ``None``: as so far
     :param samples: number of samples of the forecast
     :param end_is_asked: whether an end that cannot be predicted is an error instead of an unknown
+    :param fixes_constants: see :func:`estimate`
     """
     loaded = cut(discharge, settings)
     for note in loaded.notes:
         warnings.warn(note, stacklevel=3)
     if end_is_asked and _is_below_all_sizes(loaded):
         raise ValueError(Reason.BELOW_ALL_SIZES.text)
-    fit, end = estimate(loaded), None
+    fit, end = estimate(loaded, fixes_constants), None
     for note in fit.notes:
         warnings.warn(note, stacklevel=3)
     sized = _of_its_size(fit.estimate, loaded)
@@ -247,7 +253,8 @@ def cut(discharge: Discharge, settings: Settings) -> LoadedPart:
         measured = discharge if resolved.thermal else discharge.without_temperature()
         start = soc_from_rest(measured, cell, resolved.mismatch_V)
     else:
-        start = Start(*check_initial_soc(settings.initial_soc))
+        soc, sd_soc = check_initial_soc(settings.initial_soc)
+        start = Start(soc, sd_soc)
     return LoadedPart(
         settings=settings.expecting(mean_current_A(record)),
         discharge=discharge,
@@ -261,8 +268,11 @@ def cut(discharge: Discharge, settings: Settings) -> LoadedPart:
     )
 
 
-def estimate(loaded: LoadedPart) -> Fit:
-    """Fit the model to a discharge by the method of its settings, and collect the evidence against that."""
+def estimate(loaded: LoadedPart, fixes_constants: bool = False) -> Fit:
+    """
+    Fit the model to a discharge by the method of its settings, and collect the evidence against that. Fixed constants carry
+    over with the parameters, but age: the resistance after ten seconds is always that of free ones.
+    """
     settings, record, start, cell = loaded.settings, loaded.record, loaded.start, loaded.cell
     resolved, thermal = settings.resolved, settings.resolved.thermal
     calibrator = settings.calibrator(cell, start, settings.usual_q_mobile_C if loaded.in_progress else None)
@@ -273,15 +283,19 @@ def estimate(loaded: LoadedPart) -> Fit:
         result = _SMALLEST
     else:
         # a temperature that the model holds is that of the settings, whatever was measured
-        result = calibrator.estimate(record if resolved.thermal else record.without_temperature())
+        fitted = record if resolved.thermal else record.without_temperature()
+        result = calibrator.estimate(fitted)
+        if fixes_constants:
+            fixed = replace(settings, cell_rates_sd={}).calibrator(cell, start)
+            result = _with_resistance_of(result, fixed.estimate(fitted))
     if doubts := start.findings or settings.other_load(mean_current_A(record)):
-        # of the charge: the resistance, which is settled within 30 %, is not in question
+        # doubts about the charge leave the resistance settled, which may be off by 30 %
         result = replace(result, settled_q_mobile=False, findings=(*result.findings, *doubts))
     if other_size := settings.other_size(result, float(loaded.part.charge_C)):
         # the scale of the current is in question, and all numbers with it
         result = replace(result, settled=False, settled_q_mobile=False, settled_r_o=False, settled_resistance_10s=False)
         result = replace(result, findings=(*other_size, *result.findings))
-    # a cell in progress has not ended, however low its model comes in the pulses before
+    # a discharge in progress has not ended, even if the voltage of the model was below the cut-off in a pulse
     cut_off_V, current_A = (-np.inf, 0.0) if loaded.in_progress else (resolved.cut_off_V, loaded.load.mean_A)
     voltage = model.forecast(record, result, cut_off_V, current_A)
     history, parameters = history_of(record, resolved.usual_start), (result.q_mobile, result.r_o)
@@ -304,7 +318,7 @@ def predict(loaded: LoadedPart, fit: Fit, load: LoadToCome | None = None, sample
         nominal_Ah=settings.nominal_Ah,
         samples=samples,
     )
-    # a stream of its own: the draws of the forecast have the seed 0
+    # independent of the draws of the forecast, whose seed is 0
     gains = 1.0 + settings.current_gain_sd * np.random.default_rng([0, 1]).standard_normal(samples)
     load_A = loaded.load.mean_A if load is None else _largest_A(load, cut_off_V)
     # a cell without a known capacity when new has no health
@@ -321,7 +335,7 @@ def predict(loaded: LoadedPart, fit: Fit, load: LoadToCome | None = None, sample
 
 
 def _charge_after_C(discharge: Discharge, eod_time_s: float) -> float:
-    """The charge drawn after the cut-off, C, if that is more than a discharge leaves behind: then it was not the end."""
+    """Return the charge drawn after the cut-off, C; 0 for as little as a discharge may leave behind."""
     if np.isnan(eod_time_s):
         return 0.0
     until_C, in_all_C = integrate_load(discharge.time_s, discharge.current_A, [eod_time_s, discharge.time_s[-1]]).tolist()
@@ -331,8 +345,8 @@ def _charge_after_C(discharge: Discharge, eod_time_s: float) -> float:
 
 def _at_the_temperature(cell: CellParameters, record: Discharge, settings: Settings) -> CellParameters:
     """
-    Constants of the model in the surroundings that were measured at load-on, or are known of the record. Those of a path,
-    or that a policy has learned of, hold at one temperature.
+    Return constants at the temperature measured at the start of the load, or else at the ambient temperature of the record.
+    Constants of a path, and those of a policy, hold at one temperature.
     """
     ambient_C = record.meta.get("ambient_temperature_C")
     if record.temperature_C is not None:
@@ -343,7 +357,7 @@ def _at_the_temperature(cell: CellParameters, record: Discharge, settings: Setti
 
 
 def _is_below_all_sizes(loaded: LoadedPart) -> bool:
-    """Whether the smallest cell of the model ends above a record, so that a search, which may take minutes, is in vain."""
+    """Return whether even the smallest cell of the model ends above a record, so that a search of minutes is useless."""
     if loaded.part.charge_C > _SMALLEST.q_mobile:
         return False
     model = RecordModel(loaded.cell, initial_soc=loaded.start.soc)
@@ -351,8 +365,24 @@ def _is_below_all_sizes(loaded: LoadedPart) -> bool:
     return bool(voltage.at_samples_V[-1] > loaded.record.voltage_V[-1])
 
 
+def _with_resistance_of(free: Estimate, fixed: Estimate) -> Estimate:
+    """Return the estimate with fixed constants, but for its resistance after ten seconds."""
+    name = "resistance_10s"
+    findings = [each for each in fixed.findings if each.number != name] + [
+        each for each in free.findings if each.number == name
+    ]
+    return replace(
+        fixed,
+        resistance_10s_ohm=free.resistance_10s_ohm,
+        sd_resistance_10s_ohm=free.sd_resistance_10s_ohm,
+        settled_resistance_10s=free.settled_resistance_10s,
+        settled=True,  # as both numbers are
+        findings=tuple(findings),
+    )
+
+
 def _in_units_of_the_sensor(result: Estimate, gain_sd: float) -> Estimate:
-    """Without the gain of the current sensor, which cancels from an end: the load to come is what the sensor will read."""
+    """Remove the gain of the current sensor, which cancels from an end: the load to come is what the sensor will read."""
     left_C2, left_ohm2 = (
         max(sd**2 - (gain_sd * value) ** 2, 0.0)
         for value, sd in ((result.q_mobile, result.sd_q_mobile), (result.r_o, result.sd_r_o))
@@ -361,14 +391,14 @@ def _in_units_of_the_sensor(result: Estimate, gain_sd: float) -> Estimate:
 
 
 def _largest_A(load: LoadToCome, cut_off_V: float) -> float:
-    """The largest current of a load to come, of a power that at the cut-off; 0 if it is not known."""
+    """Return the largest current of a load to come, of a power at the cut-off; 0 if it is unknown."""
     if isinstance(load, Load):
         return float(load.value.max()) / (1.0 if load.unit == "current" else cut_off_V)
     return float(load) if isinstance(load, Real) else 0.0
 
 
 def _notes(loaded: LoadedPart, fit: Fit, load_A: float) -> Iterator[str]:
-    """What a forecast rests on, beyond the last sample under load."""
+    """The assumptions of a forecast, beyond those of :func:`forecast`."""
     settings, end_s, rmse_V = loaded.settings, float(loaded.record.time_s[-1]), _rmse_V(loaded, fit)
     # the load so far may be of the same finding
     yield from (str(each) for each in settings.other_load(load_A) if each not in fit.estimate.findings)
@@ -386,7 +416,7 @@ def _rmse_V(loaded: LoadedPart, fit: Fit) -> float:
 
 
 def _of_its_size(result: Estimate, loaded: LoadedPart) -> Estimate:
-    """Without numbers where the search ended at its bound, as for a cell of far another size: a bound is no result."""
+    """Remove the numbers if the search has ended at a bound, as for a cell of far another size: a bound is no result."""
     (low_C, high_C), near = loaded.settings.q_mobile_bounds_C, 1.0 - _AT_BOUND
     if low_C < near * result.q_mobile < near**2 * high_C:
         return result
@@ -397,7 +427,7 @@ def _of_its_size(result: Estimate, loaded: LoadedPart) -> Estimate:
 
 
 def _charge(loaded: LoadedPart, fit: Fit, end: Forecast | None) -> dict[str, float]:
-    """The columns of what was drawn, and of what a full cell would have given: its end comes at the same charge."""
+    """The columns of the charge drawn, and of the capacity from full: a full cell ends at the same charge left."""
     drawn_Ah, start, q_mobile = loaded.part.charge_C / 3600.0, loaded.start, fit.estimate.q_mobile
     capacity_Ah = drawn_Ah if start.soc == 1.0 and not loaded.in_progress else nan
     predicted_Ah, sd_Ah = (1.0 - start.soc) * q_mobile / 3600.0 + drawn_Ah, loaded.settings.current_gain_sd * drawn_Ah
@@ -421,17 +451,17 @@ def _charge(loaded: LoadedPart, fit: Fit, end: Forecast | None) -> dict[str, flo
 
 def _is_all_logged(loaded: LoadedPart, evidence: Evidence) -> bool:
     """
-    Whether all that was drawn is in the record: the cell starts, before or under the load, no lower than with this charge, no
-    sensor fails, and the voltage says of each gap that its charge was drawn.
+    Return whether the record has all charge drawn: the first voltage is not below that of the charge at the start, no sensor
+    fails, and the voltage confirms the charge of each gap.
     """
-    # a charge that tapered off fills any cell, whatever its voltage at rest
+    # a charge with a tapered current fills any cell, at any voltage at rest
     charge = loaded.record.history.charge
     is_lower = evidence.first_V < evidence.start_V and not (charge and charge.is_tapered)
     return not (evidence.fault or (is_lower and evidence.start) or evidence.charges_C[Doubt.GAP])
 
 
 def _nominal_Ah(loaded: LoadedPart, model: RecordModel) -> float:
-    """The capacity of the cell when new, Ah: as stated, or as its constants tell at this load; NaN if they do not."""
+    """Return the capacity of the cell when new, Ah: as stated, or by its constants at this load; NaN if unknown."""
     settings, load_A = loaded.settings, loaded.load.mean_A
     if settings.nominal_Ah is not None:
         return settings.nominal_Ah
@@ -442,6 +472,6 @@ def _nominal_Ah(loaded: LoadedPart, model: RecordModel) -> float:
 
 
 def _middle(values: FloatArray, result: Estimate) -> tuple[float, float]:
-    """The median of samples, and the standard deviation that nine of ten samples show, if the estimate states one."""
+    """Return the median of samples, and the standard deviation by their central 90 %, if the estimate states one."""
     low, median, high = np.where(np.isfinite(values := quantile(values)), values, np.nan).tolist()
     return median, (high - low) / (2.0 * _BAND_SD) if np.isfinite(result.sd_q_mobile) else nan
