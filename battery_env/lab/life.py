@@ -26,6 +26,7 @@ from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import Alternative, LeastSquares, RecordFit
+from battery_env.estimators.priors import PathPrior
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
@@ -229,8 +230,9 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     if calibrator is None:
         return life_before(discharges, Settings(cut_off_V=cut_off_V))
     held = copy(calibrator)
-    if held.path is None:
-        held.nuisance = {name: sd for name, sd in held.nuisance.items() if name not in RATE_CONSTANTS}
+    if not isinstance(held.prior, PathPrior):
+        rates_held = {name: sd for name, sd in held.prior.nuisance.items() if name not in RATE_CONSTANTS}
+        held.prior = replace(held.prior, nuisance=rates_held)
     return _track(discharges, cut_off_V, held, calibrator)
 
 
@@ -304,7 +306,7 @@ def _row_of(
     record = discharge.loaded_part(cut_off_V)
     fit = unsure.fit(record)
     of_its_own = unsure.estimate_of(fit)
-    estimate = of_its_own if held.nuisance == unsure.nuisance else held.estimate(record)
+    estimate = of_its_own if held.prior.nuisance == unsure.prior.nuisance else held.estimate(record)
     end_s = held.model.forecast(record, estimate, cut_off_V).eod_time_s
     capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
