@@ -21,7 +21,6 @@ from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
-from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
@@ -229,8 +228,7 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     if calibrator is None:
         return life_before(discharges, Settings(cut_off_V=cut_off_V))
     fixed = copy(calibrator)
-    if fixed.path is None:
-        fixed.nuisance = {name: sd for name, sd in fixed.nuisance.items() if name not in RATE_CONSTANTS}
+    fixed.prior = fixed.prior.with_fixed_rates()
     return _track(discharges, cut_off_V, fixed, calibrator)
 
 
@@ -304,7 +302,7 @@ def _row_of(
     record = discharge.loaded_part(cut_off_V)
     fit = free.fit(record)
     with_free_constants = free.estimate_of(fit)
-    estimate = with_free_constants if fixed.nuisance == free.nuisance else fixed.estimate(record)
+    estimate = with_free_constants if fixed.prior.nuisance == free.prior.nuisance else fixed.estimate(record)
     end_s = fixed.model.forecast(record, estimate, cut_off_V).eod_time_s
     capacity_Ah = float(integrate_load(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
