@@ -143,7 +143,9 @@ def plot(rows: pd.DataFrame) -> Figure:
         axes.plot(group["discharge"], group["count_error_percent"], "x", ms=4, color=COLOURS[1], label="last charge, counted")
         axes.axhline(0.0, color="black", lw=0.6)
         axes.set(title=CELLS[str(cell)].title, xlabel="discharge", ylabel="error of the end, half seen (%)")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        # a cell of a single discharge has one tick, too
+        axes.set_xlim(group["discharge"].min() - 0.5, group["discharge"].max() + 0.5)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     return figure
 

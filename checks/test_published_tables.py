@@ -3,14 +3,7 @@
 import json
 from functools import partial
 
-from benchmarks import (
-    calibrators,
-    direct_mapping,
-    other_cells,
-    published,
-    speed,
-    stabilisation,
-)
+from benchmarks import calibrators, direct_mapping, other_cells, published, speed, stabilisation
 from benchmarks.study import read_tables
 from checks.pages import DOCS
 
