@@ -214,8 +214,8 @@ class FullState(Calibration):
             "end of discharge (%)": ("eod_error_percent", with_spread),
             **_TIMES,
         }
-        shown = table_of(table, {"env": "environment", "parameter": "parameter", "label": "calibrator"}, cells)
-        return shown, table.drop(columns=["label", *OF_RUN])
+        for_readers = table_of(table, {"env": "environment", "parameter": "parameter", "label": "calibrator"}, cells)
+        return for_readers, table.drop(columns=["label", *OF_RUN])
 
 
 class VoltageOnly(Calibration):
@@ -243,10 +243,10 @@ class VoltageOnly(Calibration):
 
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
         self.write_learning(runs, study)
-        who = ["label", "seed", "training_minutes", "tables"]
+        columns = ["label", "seed", "training_minutes", "tables"]
         tables = [
             run["scores"].assign(calibrator=label, seed=seed, training_minutes=minutes)
-            for label, seed, minutes, run in runs[who].itertuples(index=False)
+            for label, seed, minutes, run in runs[columns].itertuples(index=False)
         ]
         peers = [{"env_id": self.env_id, "calibrator": name} for name in self.peers()]
         scores = pd.concat([*tables, study.run(peer_scores, peers)["scores"]], ignore_index=True)

@@ -250,10 +250,10 @@ class Rows:
 
     def of(self, runs: Sequence[Run]) -> pd.DataFrame:
         """The rows of trainings in their order, of the last release that made one."""
-        who = ["task", "algorithm", "seed", "timesteps"]
-        known = self.read().drop_duplicates(who, keep="last").set_index(who)
-        wanted = [(run.task, run.algorithm, run.seed, run.timesteps) for run in runs]
-        return known.loc[[each for each in wanted if each in known.index]].reset_index()
+        identity = ["task", "algorithm", "seed", "timesteps"]
+        last_rows = self.read().drop_duplicates(identity, keep="last").set_index(identity)
+        keys = [(run.task, run.algorithm, run.seed, run.timesteps) for run in runs]
+        return last_rows.loc[[each for each in keys if each in last_rows.index]].reset_index()
 
     def has(self, run: Run) -> bool:
         """Whether a training is done."""
@@ -265,8 +265,8 @@ class Rows:
         self.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(self.folder / ".runs.lock"):
             # as texts: no number changes for being read and written
-            together = pd.concat([self.read(str), rows.astype({name: str for name in _KEY})])
-            write_csv(self.folder, "runs", together.drop_duplicates(_KEY).to_csv(index=False))
+            table = pd.concat([self.read(str), rows.astype({name: str for name in _KEY})])
+            write_csv(self.folder, "runs", table.drop_duplicates(_KEY).to_csv(index=False))
 
 
 def save_checkpoint(model: BaseAlgorithm, file: Path, progress: Mapping[str, Any]) -> None:
@@ -467,10 +467,10 @@ class Trainer:
         progress = Progress(run, checkpoint_file(run, self.checkpoints), self.judge, self.deadline)
         model = train(progress, self.compiled)
         machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-        made = {"minutes": progress.seconds / 60.0, "resumed": progress.resumed, "machine": machine}
-        made["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
+        provenance = {"minutes": progress.seconds / 60.0, "resumed": progress.resumed, "machine": machine}
+        provenance["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
         curve = {f"after_{100 * point // POINTS}_percent": value for point, value in enumerate(progress.curve, 1)}
-        row = {**run.key, **curve, **(self.describe(model, run) if self.describe else {}), **made}
+        row = {**run.key, **curve, **(self.describe(model, run) if self.describe else {}), **provenance}
         Rows(self.folder).add(pd.DataFrame([row]))
         progress.file.unlink(missing_ok=True)
 
@@ -506,8 +506,8 @@ def make_rows(study: Study, runs: Sequence[Run], judge: Judge, describe: Judge |
         describe = importable(describe) if describe else None
         trainer = Trainer(study.out, chosen.checkpoints, importable(judge), describe, deadline, chosen.compile)
         study.each(trainer, [(run,) for run in runs if not rows.has(run)])
-    done = rows.of(runs)
-    whole = done[done.groupby(["task", "algorithm"])["seed"].transform("nunique") == len(set(chosen.seeds))]
-    if whole.empty:
+    rows_of_runs = rows.of(runs)
+    complete = rows_of_runs[rows_of_runs.groupby(["task", "algorithm"])["seed"].transform("nunique") == len(set(chosen.seeds))]
+    if complete.empty:
         raise SystemExit("No algorithm has all of its seeds on a task yet: the same command goes on from the checkpoints.")
-    return whole
+    return complete
