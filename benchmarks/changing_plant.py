@@ -57,7 +57,7 @@ LEVEL = 0.98
 
 
 def ranges_of(env_id: str) -> dict[str, tuple[float, float]]:
-    """What each episode of a training draws: up to what the published table of robustness tries policies with."""
+    """Ranges that each training episode samples from: up to what the published table of robustness tries policies with."""
     impulse, _, process_noise, observation_noise, delay = DISTURBANCES[env_id]
     name, ends, _ = PARAMETERS[env_id]
     largest = {"impulse": impulse, "process_noise": process_noise, "observation_noise": observation_noise}

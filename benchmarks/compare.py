@@ -91,7 +91,7 @@ def _folder(run: Run, out: Path) -> Path:
 
 
 def finished_runs(study: Study) -> pd.DataFrame:
-    """What the finished runs in a folder say, one row per run, with its tables."""
+    """Collect the finished runs of a folder, one row per run, with its tables."""
     rows = []
     for arguments, tables in study.done(part):
         run = Run(**arguments["run"])

@@ -110,7 +110,7 @@ def shares_of(outcome: pd.DataFrame, tolerance: float) -> dict[str, float]:
 
 
 def summary(outcome: pd.DataFrame, tolerance: float) -> dict[str, float]:
-    """What the episodes of a roll-out cost, and where they end."""
+    """Summarise the costs of the episodes of a roll-out, and where they end."""
     return {
         "cost": outcome["cost"].mean(),
         "cost_worst": outcome["cost"].max(),

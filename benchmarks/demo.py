@@ -39,7 +39,7 @@ EVALUATIONS, EVERY, EVERY_IN_THE_END = 5, 40, 8
 
 
 class Learned(NamedTuple):
-    """What one algorithm reached: its errors while it learned, and on each discharge in the end."""
+    """Errors of one algorithm: while it learned, and on each discharge in the end."""
 
     curve: pd.DataFrame
     scores: pd.DataFrame

@@ -260,7 +260,7 @@ def exact_part(parameter: Parameter, division: str) -> Tables:
 
 
 def report(results: pd.DataFrame, configuration: Mapping[str, Any]) -> str:
-    """What is compared, and the table."""
+    """Write the text and the table."""
 
     def seeds(group: pd.DataFrame) -> pd.Series:
         return group.groupby("seed", sort=False, dropna=False)["mape_percent"].mean()
@@ -311,7 +311,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for seed in chosen.seeds
         for parameter in ENV_IDS
     ]
-    for parameter in get_args(Parameter):
+    for parameter in () if study.redraws else get_args(Parameter):
         training_file(parameter, study.out)  # here, as parts that make the same file meet
     tables_of_parts = [study.run(mapping_part, mappings), study.run(policy_part, policies, out=study.out)]
     tables_of_parts.append(study.run(exact_part, places))

@@ -108,13 +108,13 @@ def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -
 
 
 def mean_return(model: OffPolicyAlgorithm, run: Run) -> float:
-    """Of the held-out episodes."""
+    """Mean return of the held-out episodes."""
     outcome = roll_out(model, partial(gym.make, run.task), EPISODES)
     return -float((outcome["cost"] * outcome["length"]).mean())
 
 
 def difference(scores: np.ndarray, rival_scores: np.ndarray, axis: int = -1) -> np.ndarray:
-    """How much larger the mean of our scores is."""
+    """Difference of the mean scores."""
     return np.asarray(scores.mean(axis) - rival_scores.mean(axis))
 
 

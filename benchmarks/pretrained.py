@@ -99,7 +99,7 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def card_of(run: Run, scores: pd.DataFrame, command: str, minutes: float) -> dict[str, Any]:
-    """What a policy says of itself."""
+    """Write the card of a policy."""
     return {
         "env_id": run.task,
         "options": OPTIONS,

@@ -190,7 +190,7 @@ def part(
 
 
 def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """What disturbances do to the policies for one environment, by what it is judged by."""
+    """Tabulate each policy under each disturbance, by the measure of the environment."""
     (env_id,) = results["environment"].unique()
     measure, _ = MEASURES[env_id]
     cell = share_with_range if measure == "died" else side_by_side
@@ -230,7 +230,7 @@ def _set_scale(axes: Axes, measure: str, along: str) -> None:
 
 
 def plot_learning(learning: pd.DataFrame, results: pd.DataFrame) -> Figure:
-    """What the mean action costs while policies are trained, and the share of episodes that come to rest."""
+    """Plot the cost of the mean action while policies are trained, and the share of episodes that settle."""
     envs = list(learning["environment"].unique())
     figure, panels = new_panels(2 * len(envs), 2, (3.9, 2.4), margin=(0.0, 0.3))
     measures = [(env_id, measure, label) for env_id in envs for measure, label in _LEARNED.items()]
@@ -249,7 +249,7 @@ def plot_learning(learning: pd.DataFrame, results: pd.DataFrame) -> Figure:
 
 
 def plot_impulses(results: pd.DataFrame) -> Figure:
-    """What impulses of a size do, by what an environment is judged by."""
+    """Plot the measure of an environment by the size of impulses."""
     pushed = results[results["disturbance"].isin(["none", "impulses"])]
     envs = list(pushed["environment"].unique())
     figure, panels = new_panels(len(envs), 2, (3.9, 2.6), margin=(0.0, 0.3))
@@ -263,7 +263,7 @@ def plot_impulses(results: pd.DataFrame) -> Figure:
 
 
 def plot_changes(results: pd.DataFrame) -> Figure:
-    """What all other changes do: each seed, and the median."""
+    """Plot the measure under all other changes: each seed, and the median."""
     changed = results[results["disturbance"] != "impulses"]
     envs = list(changed["environment"].unique())
     figure, panels = new_panels(len(envs), 2, (5.0, 4.6), margin=(0.0, 0.3))

@@ -53,7 +53,7 @@ def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -
 
 
 def percent_off(model: OffPolicyAlgorithm, task: str) -> float:
-    """How far off the parameter of held-out discharges is, in the mean, by the mean action."""
+    """Mean error of the parameter of held-out discharges with the mean action, in percent."""
     env = gym.make(task, split="test", episode_steps=BATTERY_STEPS)
     (parameter,) = env.unwrapped.task.parameters  # type: ignore[attr-defined]
     errors = []

@@ -127,7 +127,7 @@ class Run:
 
     @property
     def key(self) -> dict[str, Any]:
-        """What tells its row from others."""
+        """Columns that tell its row from other rows."""
         package, name = self.kind.split(":")
         modules = [package, *self.task.split(":")[:-1]]
         configuration = {"class": name, "settings": self.settings, "environment": self.environment, "defaults": self.defaults}
@@ -137,7 +137,7 @@ class Run:
 
     @property
     def defaults(self) -> dict[str, Any]:
-        """What the class has where nothing is stated: a change of a default makes another training."""
+        """Defaults of the class where nothing is stated: a change of a default makes another training."""
         critic = getattr(self.type.policy_aliases.get("MlpPolicy"), "critic_class", None)
         parameters = [each for kind in (self.type, critic) if kind for each in signature(kind).parameters.values()]
         stated = NOT_LEARNING | set(self.settings) | set(_evaluated(self.settings.get("policy_kwargs", {})))
@@ -210,7 +210,7 @@ class Run:
 
 
 def _version(module: str) -> str:
-    """What a module is known by: its release, or the one to come; of one's own what its source is."""
+    """Name a module by its release, or the one to come, and a module of one's own by its source."""
     if module in RELEASED:
         return f"{module} {importlib.import_module(module).__version__.partition('.dev')[0]}"
     return f"{module} {_digest_of_source(module)}"
@@ -256,7 +256,7 @@ class Rows:
         return last_rows.loc[[each for each in keys if each in last_rows.index]].reset_index()
 
     def has(self, run: Run) -> bool:
-        """Whether a training is done."""
+        """Tell whether a training is done."""
         rows = self.read()
         return bool((rows[_KEY].astype(str) == pd.Series(run.key).astype(str)).all(axis="columns").any())
 
@@ -417,17 +417,17 @@ def train_or_load(
 
 
 def record_file(run: Run, folder: Path) -> Path:
-    """Where :func:`train_or_load` says what made a model."""
+    """File in which :func:`train_or_load` records what made a model."""
     return folder / f"model_{run.name}.json"
 
 
 def checkpoint_file(run: Run, folder: Path) -> Path:
-    """Where the checkpoint of a training lies."""
+    """File of the checkpoint of a training."""
     return folder / f"checkpoint_{run.name}.zip"
 
 
 def made_by(run: Run, folder: Path) -> dict[str, Any]:
-    """What made a model that is there."""
+    """Read the record of a model that is there."""
     record = recall(record_file(run, folder))
     assert record is not None
     return record
@@ -476,7 +476,7 @@ class Trainer:
 
 
 def rows_command_line(name: str, document: str | None, timesteps: str) -> argparse.ArgumentParser:
-    """What studies of such rows have in common: their folder is that of what is published."""
+    """Make the command line of a study of such rows, whose folder is that of the published tables."""
     parser = command_line(name, document)
     parser.set_defaults(out=Path("docs/results") / name)
     parser.add_argument("--seeds", nargs="+", type=natural, default=[1, 2, 3, 4, 5])

@@ -54,7 +54,7 @@ _SAMPLES, _PROGPY_SAMPLES, _PARTICLES_SAMPLES = 600, 20, 4
 
 
 def race(contestants: dict[str, Callable[[], int]], rounds: int, clock: Callable[[], float]) -> pd.DataFrame:
-    """How much each contestant does a second, in turns."""
+    """Measure the work of each contestant a second, in turns."""
     speeds = []
     for number in trange(rounds, desc="rounds", disable=None):
         speed = {}
@@ -195,14 +195,14 @@ def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
 
 
 def measure_filters(rounds: int) -> tuple[pd.DataFrame, str]:
-    """How long an update of those takes."""
+    """Measure how long an update of a calibrator takes."""
     with TemporaryDirectory() as folder:
         speeds = race(filter_contestants(Path(folder)), rounds, time.process_time)
     return speeds, report_filters(speeds)
 
 
 def report_filters(speeds: pd.DataFrame) -> str:
-    """What was measured of filters, as Markdown."""
+    """Write the measured times of calibrators as Markdown."""
     rows = []
     for name, values in speeds.items():
         ratio = speeds["progpy, unscented Kalman filter"].rdiv(values)
@@ -219,7 +219,7 @@ def report_filters(speeds: pd.DataFrame) -> str:
 
 
 def spread(values: pd.Series, digits: int) -> str:
-    """What was measured in many rounds, as readers see it."""
+    """Median and quartiles of many rounds, as readers see them."""
     low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
     return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 

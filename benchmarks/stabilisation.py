@@ -97,7 +97,7 @@ class Contender:
     defaults: bool = False
 
     def run(self, env_id: str, seed: int, timesteps: int | None) -> Run:
-        """What is trained."""
+        """Return the training."""
         chosen = {name: getattr(self, name) for name in ("settings_of", "differing", "defaults", "label")}
         return zoo_run(self.algo, env_id, seed, timesteps, **chosen)
 
@@ -211,7 +211,7 @@ def in_order(tables: Tables, order: Sequence[str]) -> dict[str, pd.DataFrame]:
 
 
 def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """What policies cost and where they end, without disturbances."""
+    """Tabulate costs and final errors of policies without disturbances."""
     cells: dict[str, Cell] = {
         "seeds": of_trained(lambda group: str(len(group))),
         "updates": of_trained(lambda group: f"{group['updates'].max():.0f}"),
@@ -225,7 +225,7 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def undisturbed_text(results: pd.DataFrame) -> list[str]:
-    """The same, as Markdown below what its numbers are."""
+    """Write this table as Markdown, below a caption."""
     caption = (
         "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of episodes "
     )
@@ -233,7 +233,7 @@ def undisturbed_text(results: pd.DataFrame) -> list[str]:
 
 
 def disturbed_table(results: pd.DataFrame, cell: Callable[[pd.DataFrame], str]) -> pd.DataFrame:
-    """What each disturbance does, as one cell says of all tries of a policy."""
+    """Tabulate each disturbance, with one cell for all tries of a policy."""
     conditions = results["disturbance"].unique()
     cells = {name: lambda tries, name=name: cell(tries[tries["disturbance"] == name]) for name in conditions}
     return table_of(results, ["environment", "policy"], cells)
@@ -250,7 +250,7 @@ def ends_of(tries: pd.DataFrame) -> str:
 
 
 def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
-    """What the certificates say."""
+    """Tabulate the certificates."""
 
     def interval_or_dash(values: pd.Series) -> str:
         return with_interval(values.dropna()) if values.notna().any() else "-"

@@ -178,12 +178,12 @@ def share_with_range(values: pd.Series) -> str:
 
 
 def share_in_percent(values: pd.Series) -> str:
-    """Which share of them is true."""
+    """Share that is true, in percent."""
     return f"{100 * values.mean():.0f}"
 
 
 def count_of(values: pd.Series) -> str:
-    """How many of a few are true."""
+    """Number of a few that are true."""
     return f"{values.sum()} of {len(values)}"
 
 
@@ -277,8 +277,8 @@ def run_named(
 
 def command_line(name: str, document: str | None, jobs: int | None = 2) -> argparse.ArgumentParser:
     """
-    What the command lines of all studies have in common: ``--jobs``, ``--scheduler``, ``--redraw`` and ``--out``. The name is
-    that of the module, and of the study if the module has several.
+    Make the command line of a study, with what all have in common: ``--jobs``, ``--scheduler``, ``--redraw`` and ``--out``.
+    The name is that of the module, and of the study if the module has several.
     """
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks.{name}", description=document, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -437,8 +437,8 @@ def importable(function: Callable[..., Result]) -> Callable[..., Result]:
 
 def recall(file: Path) -> dict[str, Any] | None:
     """
-    What a file says of something that is done, which is written last; None if there is none. A damaged one is set aside, and
-    what it stood for is made again.
+    Read the file that is written last of something that is done; None if there is none. A damaged file is set aside, and its
+    content is made again.
     """
     if not file.exists():
         return None
