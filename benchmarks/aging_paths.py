@@ -49,7 +49,7 @@ from battery_env.parameters import PARAMETER_NAMES
 from battery_env.plotting import coloured
 from battery_env.policies.policy_estimator import Predictor
 from battery_env.policies.pretrained import file_stem, write_card
-from battery_env.records import drawn
+from battery_env.records import integrate_load
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
 from battery_env.records.model import RecordModel
 from benchmarks.kalman_filter import PlainKalmanFilter
@@ -288,7 +288,7 @@ def _regression(labelled: Sequence[Discharge], whole: _Whole, record: Discharge)
 
 def _steps_V(record: Discharge, charge_C: float) -> FloatArray:
     """Falls of the voltage over equal steps of charge, up to one."""
-    drawn_C = drawn(record.time_s, record.current_A, record.time_s)
+    drawn_C = integrate_load(record.time_s, record.current_A, record.time_s)
     at_C = charge_C * (np.arange(_STEPS + 1) + 0.5) / (_STEPS + 1)
     return np.diff(np.interp(at_C, drawn_C - drawn_C[0], record.voltage_V))
 

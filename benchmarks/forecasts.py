@@ -32,7 +32,7 @@ from battery_env.lab.life import Life, track_life
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, RandomPiecewise, RandomWalk, constant
-from battery_env.records import Record, drawn
+from battery_env.records import Record, drawn_charge_C, integrate_load
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from benchmarks.study import Cell, Study, command_line, markdown, natural, positive, table_of
 
@@ -81,14 +81,14 @@ def as_long_as_the_last(last: Record, seen: Record, load: Load) -> float:
 
 def coulomb_count(last: Record, seen: Record, load: Load) -> float:
     """It ends when the charge of the last one was drawn."""
-    left_C = drawn(last.time_s, last.current_A, last.time_s[-1]) - drawn(seen.time_s, seen.current_A, seen.time_s[-1])
+    left_C = drawn_charge_C(last) - drawn_charge_C(seen)
     since_s = np.arange(_LONGEST_S)
     return float(seen.time_s[-1] + np.interp(max(float(left_C), 0.0), load.drawn(since_s), since_s))
 
 
 def last_curve(last: Record, seen: Record, load: Load) -> float:
     """It ends as the voltage over charge of the last one does, with the resistance that fits best."""
-    charge_C, seen_C = (drawn(each.time_s, each.current_A, each.time_s) for each in (last, seen))
+    charge_C, seen_C = (integrate_load(each.time_s, each.current_A, each.time_s) for each in (last, seen))
     usual_A = charge_C[-1] / (last.time_s[-1] - last.time_s[0])
     # beyond its end the curve falls on
     end_C, end_V = charge_C[-1], last.voltage_V[-1]

@@ -323,7 +323,7 @@ class Study:
         if self.scheduler is not None:
             self.out = self.out.absolute()  # workers are elsewhere
             try:
-                with workers(scheduler=self.scheduler):
+                with workers(1, self.scheduler):
                     pass
             except (ImportError, OSError) as error:
                 parser.error(str(error))

@@ -6,6 +6,7 @@ from functools import partial
 from benchmarks import (
     calibrators,
     direct_mapping,
+    other_cells,
     published,
     speed,
     stabilisation,
@@ -35,6 +36,7 @@ def of_mapping(tables):
 
 REPORTS = {
     "direct_mapping/direct_mapping": of_mapping,
+    "other_cells/other_cells": partial(of_one, other_cells.report, "other_cells"),
     "published/published": partial(of_one, published.report, "published"),
     "published_horizons/published": partial(of_one, published.report, "published"),
     "stabilisation/stabilisation": stabilisation.report,

@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 
 from battery_env import LeastSquares, Settings, load_nasa_discharges
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.estimates.findings import SETTLED_SHARES
 from battery_env.plotting import COLOURS, new_figure, save_figure
-from battery_env.records import drawn
+from battery_env.records import integrate_load
 from docs.environment_pictures import PICTURES
 
 CUT_OFF_V = 2.7
@@ -27,12 +27,12 @@ def main() -> None:
     figure = new_figure(9.0, 3.6)
     voltage, doubt = figure.subplots(1, 2)
     everything = Settings(method="least-squares").calibrator()
-    drift_mV = 1e3 * WHOLE_ERROR * everything.mismatch_V
+    drift_mV = 1e3 * UNFITTED_ERROR_RATIO * everything.mismatch_V
     for number, colour in zip((1, 84, 168), COLOURS, strict=False):
         record = discharges[number - 1].loaded_part(CUT_OFF_V)
         model = everything.model.forecast(record, everything.estimate(record), CUT_OFF_V)
         model_V = np.interp(record.time_s, model.time_s, model.voltage_V)
-        charge_C = drawn(record.time_s, record.current_A, record.time_s)
+        charge_C = integrate_load(record.time_s, record.current_A, record.time_s)
         share = charge_C / charge_C[-1]
         voltage.plot(100.0 * share, 1e3 * (record.voltage_V - model_V), color=colour, label=f"discharge {number}")
     voltage.axhspan(-drift_mV, drift_mV, color="0.9", label="drift that is expected (one sd)")

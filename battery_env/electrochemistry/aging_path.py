@@ -1,4 +1,4 @@
-"""Cells that age along a path: what their constants, their charge and their resistance may be, all at once."""
+"""Cells that age along a path: the joint distribution of their constants, their charge and their resistance."""
 
 from __future__ import annotations
 
@@ -15,33 +15,32 @@ from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS, CellParameters, check_cell
 from battery_env.electrochemistry.equilibrium import with_equilibrium
-from battery_env.electrochemistry.model_error import MORE_ERRORS
+from battery_env.electrochemistry.model_error import ERRORS_PER_DISCHARGE
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.files import read_json, write_json
 from battery_env.parameters import PARAMETER_NAMES, Q_MOBILE, R_O
 
-#: What is added to the equilibrium voltage has so many coefficients (:func:`with_equilibrium`).
+#: Number of coefficients of a change of the equilibrium voltage (:func:`with_equilibrium`).
 EQUILIBRIUM_SIZE = 8
 EQUILIBRIUM_NAMES: tuple[str, ...] = tuple(f"equilibrium {k}" for k in range(EQUILIBRIUM_SIZE))
-#: What moves along a path: logarithms of what constants of the cell are multiplied by, what is added to the equilibrium
-#: voltage, V, and the logarithms of ``q_mobile`` in C and ``r_o`` in ohm.
+#: Quantities along a path: logarithms of factors of constants, coefficients that are added to the equilibrium voltage, V, and
+#: the logarithms of ``q_mobile`` in C and ``r_o`` in ohm.
 PATH_NAMES: tuple[str, ...] = (*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES, *PARAMETER_NAMES)
-#: How far cells lie beside the path: standard deviations of these, of which no cell lies more than two away. Chosen on B0005
-#: along the path of B0006.
+#: Standard deviations of the distance of cells from the path; no cell lies more than two of them away. Chosen on B0005 along
+#: the path of B0006.
 SPREAD_SD: tuple[float, ...] = (*(0.5,) * len(UNCERTAIN_CONSTANTS), *(0.005,) * EQUILIBRIUM_SIZE, 0.03, 0.25)
-#: A cell that lies farther beside the path, in standard deviations, is of another kind.
-BESIDE_LIMIT_SD = 4.0
+#: A cell farther from the path than this, in standard deviations, is of another kind.
+PATH_DISTANCE_LIMIT_SD = 4.0
 #: Cells may be younger and older than those of the path by this share of its length.
-BEYOND_SHARE = 0.2
+PATH_EXTRAPOLATION_SHARE = 0.2
 
-# How unsure n lives leave what another cell is: standard deviations are 1 + _FEW_LIVES / n times as large. Chosen on B0006
-# along the path of B0005.
-_FEW_LIVES = 2.0
+# A path of n lives widens standard deviations 1 + _LIVES_SD_TERM / n times. Chosen on B0006 along the path of B0005.
+_LIVES_SD_TERM = 2.0
 _FORMAT, _FORMAT_VERSION = "battery_env.AgingPath", 1
 _RATES, _EQUILIBRIUM = slice(0, len(UNCERTAIN_CONSTANTS)), slice(len(UNCERTAIN_CONSTANTS), -len(PARAMETER_NAMES))
-# Beyond its ends a path goes on as over this share of its ages, as single ones scatter.
-_END_SHARE = 0.25
-# Moments of the distribution are those of so many cells.
+# A path extrapolates its mean slope over this share of its ages, because single ages scatter.
+_END_SLOPE_SHARE = 0.25
+# Number of cells that give the moments of the distribution, and the seed of the draw.
 _MOMENTS_CELLS, _MOMENTS_SEED = 4000, 0
 
 
@@ -52,8 +51,8 @@ class DrawnCells(NamedTuple):
     :param place: on the path, 0 at its start and 1 at its end, shape (n,)
     :param q_mobile: C, shape (n,)
     :param r_o: ohm, shape (n,)
-    :param factors: what ``UNCERTAIN_CONSTANTS`` are multiplied by, shape (n, 4)
-    :param equilibrium_V: what is added to the equilibrium voltage, V, shape (n, 8)
+    :param factors: of ``UNCERTAIN_CONSTANTS``, shape (n, 4)
+    :param equilibrium_V: coefficients that are added to the equilibrium voltage, V, shape (n, 8)
     """
 
     place: FloatArray
@@ -116,10 +115,11 @@ class AgingPath:
         if n < 1 or seed < 0:
             raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
         rng = np.random.default_rng(seed)
-        life, place = rng.integers(len(self.lives), size=n), rng.uniform(-BEYOND_SHARE, 1.0 + BEYOND_SHARE, size=n)
+        low, high = -PATH_EXTRAPOLATION_SHARE, 1.0 + PATH_EXTRAPOLATION_SHARE
+        life, place = rng.integers(len(self.lives), size=n), rng.uniform(low, high, size=n)
         values = np.empty((n, len(PATH_NAMES)))
         for k, rows in enumerate(self.lives):
-            values[life == k] = _at(np.array(rows), place[life == k])
+            values[life == k] = _interpolate(np.array(rows), place[life == k])
         values += np.array(SPREAD_SD) * np.clip(rng.standard_normal(values.shape), -2.0, 2.0)
         q_mobile = np.clip(np.exp(values[:, -2]), *Q_MOBILE.limits)
         r_o = np.clip(np.exp(values[:, -1]), *R_O.limits)
@@ -127,39 +127,39 @@ class AgingPath:
 
     @cached_property
     def moments(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of ``PATH_NAMES`` over the cells that are expected, shapes (14,) and (14, 14)."""
+        """Mean and covariance of ``PATH_NAMES`` over the cells of the path, shapes (14,) and (14, 14)."""
         _, q_mobile, r_o, factors, equilibrium_V = self.draw(_MOMENTS_CELLS, _MOMENTS_SEED)
         values = np.column_stack([np.log(factors), equilibrium_V, np.log(q_mobile), np.log(r_o)])
         return values.mean(axis=0), np.cov(values.T)
 
     @property
     def errors_per_C(self) -> float:
-        """How many independent errors of the model a coulomb shows, besides a first one."""
-        return MORE_ERRORS["path"] / self.cell.q_mobile
+        """Number of independent model errors per coulomb, in addition to a first one."""
+        return ERRORS_PER_DISCHARGE["path"] / self.cell.q_mobile
 
     @property
     def sd_ratio(self) -> float:
         """
-        So many times larger than a fit along the path says are the standard deviations that are stated, and the one of
-        ``q_mobile`` that has to be small to be settled: 3 for the path of one life, 2 for that of two.
+        Ratio of the standard deviations that an estimate states, and that decide whether ``q_mobile`` is settled, to the
+        standard deviations of a fit along the path: 3 for the path of one life, 2 for the path of two lives.
         """
-        return 1.0 + _FEW_LIVES / len(self.lives)
+        return 1.0 + _LIVES_SD_TERM / len(self.lives)
 
     def distance_sd(self, values: Mapping[str, float]) -> float:
         """
-        How far a cell lies from the cells that are expected, as a normal variable is as rarely.
+        Return the distance of a cell from the cells of the path, as a normal deviate of the same probability.
 
-        :param values: by ``PATH_NAMES``; parameters themselves, not their logarithms
+        :param values: by ``PATH_NAMES``; parameters, not their logarithms
         :return: standard deviations
         """
         # a resistance may be 0
-        least = np.finfo(np.float64).tiny
-        row = [np.log(max(values[name], least)) if name in PARAMETER_NAMES else values[name] for name in PATH_NAMES]
+        smallest = np.finfo(np.float64).tiny
+        row = [np.log(max(values[name], smallest)) if name in PARAMETER_NAMES else values[name] for name in PATH_NAMES]
         return float(self.distances_sd(np.array([row]))[0])
 
     def distances_sd(self, values: FloatArray) -> FloatArray:
         """
-        The same of many cells.
+        Return :meth:`distance_sd` of many cells.
 
         :param values: by ``PATH_NAMES``, shape (n, 14)
         :return: standard deviations, shape (n,)
@@ -172,7 +172,7 @@ class AgingPath:
         """
         Save the path.
 
-        :param path: where to
+        :param path: the new file
         :return: the file
         :raises FileExistsError: if the file exists already
         """
@@ -183,9 +183,9 @@ class AgingPath:
         """
         Load a path.
 
-        :param path: what :meth:`to_json` wrote
+        :param path: a file of :meth:`to_json`
         :return: the path
-        :raises ValueError: if the file is damaged, was not written so, or is of another format version
+        :raises ValueError: if the file is damaged, is another file, or has another format version
         """
         content = read_json(path, _FORMAT, _FORMAT_VERSION)
         try:
@@ -195,54 +195,55 @@ class AgingPath:
 
     def to_mapping(self) -> dict[str, Any]:
         """
-        The path as JSON holds it.
+        Return the path as JSON holds it.
 
-        :return: what :meth:`of_mapping` takes
+        :return: input of :meth:`of_mapping`
         """
         return {"names": PATH_NAMES, **asdict(self)}
 
     @classmethod
     def of_mapping(cls, content: Mapping[str, Any]) -> AgingPath:
         """
-        A path as JSON holds it.
+        Make a path from a mapping, as JSON holds it.
 
-        :param content: what :meth:`to_mapping` returned
+        :param content: output of :meth:`to_mapping`
         :return: the path
-        :raises KeyError: for a part that is missing
-        :raises TypeError: for a part that is unknown, or a value of another kind
+        :raises KeyError: for an entry that is missing
+        :raises TypeError: for an entry that is unknown, or a value of another type
         :raises ValueError: for values out of range
         """
-        parts = dict(content)
-        if tuple(parts.pop("names")) != PATH_NAMES:
+        arguments = dict(content)
+        if tuple(arguments.pop("names")) != PATH_NAMES:
             raise ValueError(f"its names are not {', '.join(PATH_NAMES)}")
-        lives = tuple(tuple(tuple(map(float, row)) for row in life) for life in parts.pop("lives"))
-        return cls(CellParameters.of_mapping(parts.pop("cell")), lives, **parts)
+        lives = tuple(tuple(tuple(map(float, row)) for row in life) for life in arguments.pop("lives"))
+        return cls(CellParameters.of_mapping(arguments.pop("cell")), lives, **arguments)
 
 
 def _normal_distances(squares: FloatArray, count: int) -> FloatArray:
-    """Normal deviates that are as rare as sums of so many squares of them (Wilson and Hilferty 1931); at least 0."""
+    """Return normal deviates of the probability of these sums of ``count`` squares (Wilson and Hilferty 1931); at least 0."""
     spread = 2.0 / (9.0 * count)
     return np.maximum(((squares / count) ** (1.0 / 3.0) - (1.0 - spread)) / np.sqrt(spread), 0.0)
 
 
 def cell_with(cell: CellParameters, constants: Mapping[str, float] | None) -> CellParameters:
-    """A cell with constants that were found beside its parameters, told from its own; ``None``: none were."""
-    found = constants or {}
-    rates = {name: getattr(cell, name) * float(np.exp(found[name])) for name in RATE_CONSTANTS if name in found}
-    if EQUILIBRIUM_NAMES[0] in found:
-        cell = with_equilibrium(cell, [found[name] for name in EQUILIBRIUM_NAMES])
+    """Return a cell with the constants of a fit, which are relative to the cell's; ``None``: the cell as it is."""
+    fitted = constants or {}
+    rates = {name: getattr(cell, name) * float(np.exp(fitted[name])) for name in RATE_CONSTANTS if name in fitted}
+    if EQUILIBRIUM_NAMES[0] in fitted:
+        cell = with_equilibrium(cell, [fitted[name] for name in EQUILIBRIUM_NAMES])
     return cell.replace(**rates) if rates else cell
 
 
-def _at(rows: FloatArray, place: FloatArray) -> FloatArray:
-    """Values at places of a life: between two ages on a straight line, beyond the ends as its first and last ages go on."""
+def _interpolate(rows: FloatArray, place: FloatArray) -> FloatArray:
+    """Return values at places of a life: linear between two ages, and extrapolated with the slopes at its ends."""
+
     last = len(rows) - 1
-    at = np.clip(place, 0.0, 1.0) * last
-    left = np.minimum(at.astype(np.int64), last - 1)
-    share = (at - left)[:, None]
-    values = (1.0 - share) * rows[left] + share * rows[left + 1]
-    span = max(round(_END_SHARE * last), 1)
-    before, after = rows[span] - rows[0], rows[last] - rows[last - span]
-    values += np.minimum(place, 0.0)[:, None] * last / span * before
-    values += np.maximum(place - 1.0, 0.0)[:, None] * last / span * after
+    position = np.clip(place, 0.0, 1.0) * last
+    lower = np.minimum(position.astype(np.int64), last - 1)
+    share = (position - lower)[:, None]
+    values = (1.0 - share) * rows[lower] + share * rows[lower + 1]
+    span = max(round(_END_SLOPE_SHARE * last), 1)
+    start_slope, end_slope = rows[span] - rows[0], rows[last] - rows[last - span]
+    values += np.minimum(place, 0.0)[:, None] * last / span * start_slope
+    values += np.maximum(place - 1.0, 0.0)[:, None] * last / span * end_slope
     return np.asarray(values)

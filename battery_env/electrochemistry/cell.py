@@ -25,28 +25,28 @@ TB, VO, VSN, VSP, QNB, QNS, QPB, QPS = range(STATE_SIZE)
 #: Charges at full charge and rest, as shares of ``q_mobile``, in the order of the state (qnB, qnS, qpB, qpS). At a
 #: fixed history of the current the charges are linear in ``q_mobile`` with this slope, at all times.
 FULL_CHARGE_SHARES: FloatArray = np.array([0.9, 0.1, 0.6, 1.0 / 15.0])
-# What leaves them for each share of q_mobile that is drawn, once the cell rests
-_DRAWN_SHARES: FloatArray = np.array([0.9, 0.1, -0.9, -0.1])
+# Decrease of these charges per share of q_mobile drawn, once the cell rests
+_DISCHARGE_SHARES: FloatArray = np.array([0.9, 0.1, -0.9, -0.1])
 
 CONSTANTS_SIZE, POLYNOMIAL_SIZE = 13, 14
 # Columns of ``PackedConstants.constants``, in SI units
 (
-    FRACTION_PER_SHARE,  # mole fraction, over the share of q_mobile that is in a surface
-    BULK_RATE,  # flow from the bulk to the surface of an electrode, over the charge of the bulk
-    SURFACE_RATE,  # flow from the surface to the bulk, over the charge of the surface
+    FRACTION_PER_SHARE,  # mole fraction per share of q_mobile in a surface
+    BULK_RATE,  # flow from the bulk to the surface of an electrode per charge of the bulk
+    SURFACE_RATE,  # flow from the surface to the bulk per charge of the surface
     R_OVER_F,
-    PER_CURRENT_N,  # Butler-Volmer: current to the argument of asinh, without the mole fraction, of the negative electrode
-    PER_CURRENT_P,  # and of the positive one
-    TO_RATE,  # of Vo
-    TSN_RATE,  # of Vsn
-    TSP_RATE,  # of Vsp
+    PER_CURRENT_N,  # negative electrode, Butler-Volmer: argument of asinh per current, without the mole fraction
+    PER_CURRENT_P,  # positive electrode, likewise
+    TO_RATE,  # relaxation rate of Vo
+    TSN_RATE,  # relaxation rate of Vsn
+    TSP_RATE,  # relaxation rate of Vsp
     U0,  # reference potential of the cell
-    WARMING,  # one over the thermal mass
-    COOLING,  # rate of the cooling
-    SURROUNDINGS,  # their temperature
+    WARMING,  # inverse of the thermal mass
+    COOLING,  # cooling rate
+    SURROUNDINGS,  # temperature of the surroundings
 ) = range(CONSTANTS_SIZE)
 
-#: Constants that nobody can measure well, as they lie in :meth:`CellParameters.packed_with`.
+#: Constants that are hard to measure, in the order of the factors of :meth:`CellParameters.packed_with`.
 UNCERTAIN_CONSTANTS: tuple[str, ...] = ("kn", "tDiffusion", "to", "tsn")
 
 _FORMAT, _FORMAT_VERSION = "battery_env.CellParameters", 1
@@ -55,7 +55,7 @@ _SIX_TENTHS = 0.6  # xnMax - xnMin: the share of all lithium sites that a full d
 
 class PackedConstants(NamedTuple):
     """
-    What the kernels read: constants of the equations, and both equilibrium-potential polynomials in y = 2x - 1.
+    Input of the kernels: constants of the equations, and both equilibrium-potential polynomials in y = 2x - 1.
 
     :param constants: one row for all cells or one row a cell, shape (1, 13) or (n, 13); its columns have names,
         ``FRACTION_PER_SHARE`` and so on
@@ -82,9 +82,9 @@ def _redlich_kister_polynomial(coefficients: tuple[float, ...], faraday: float) 
     return polynomial
 
 
-# How far a constant may be from that of a new 18650, as a factor: two are of nature; large cells are known by the others.
-_FARTHEST = {"R": 1.01, "F": 1.01, "Tb0": 2.0, "VEOD": 10.0}
-_FARTHEST_OF_OTHERS = 1e9
+# Largest ratio of a constant to that of a new 18650: R and F are physical constants, other constants may be of a large cell.
+_LARGEST_FACTORS = {"R": 1.01, "F": 1.01, "Tb0": 2.0, "VEOD": 10.0}
+_LARGEST_FACTOR = 1e9
 
 
 @dataclass(frozen=True)
@@ -168,12 +168,12 @@ class CellParameters:
                 raise ValueError(f"CellParameters: {field.name} must be finite, got {value!r}")
             if field.name not in ("U0n", "U0p", "An", "Ap", "r_o") and not value > 0.0:
                 raise ValueError(f"CellParameters: {field.name} must be greater than 0, got {value!r}")
-            usual = max(map(abs, field.default if isinstance(field.default, tuple) else (field.default,)))
-            factor = _FARTHEST.get(field.name, _FARTHEST_OF_OTHERS)
-            least = 0.0 if field.name in ("U0n", "U0p", "An", "Ap", "r_o") else usual / factor
-            if not all(least <= abs(number) <= factor * usual for number in numbers):
-                off = f"is more than {factor:g} times off the {usual:g} of a new 18650"
-                raise ValueError(f"CellParameters: {field.name} {off}, got {value!r}")
+            typical = max(map(abs, field.default if isinstance(field.default, tuple) else (field.default,)))
+            factor = _LARGEST_FACTORS.get(field.name, _LARGEST_FACTOR)
+            smallest = 0.0 if field.name in ("U0n", "U0p", "An", "Ap", "r_o") else typical / factor
+            if not all(smallest <= abs(number) <= factor * typical for number in numbers):
+                problem = f"is more than {factor:g} times off the {typical:g} of a new 18650"
+                raise ValueError(f"CellParameters: {field.name} {problem}, got {value!r}")
         for name in ("An", "Ap"):
             if not 1 <= len(getattr(self, name)) < POLYNOMIAL_SIZE:
                 raise ValueError(
@@ -192,10 +192,7 @@ class CellParameters:
 
     @classmethod
     def from_json(cls, path: str | os.PathLike[str]) -> CellParameters:
-        """
-        Load what :meth:`to_json` wrote; a ``ValueError`` for a file that is damaged, another one, or of another format
-        version.
-        """
+        """Load a file of :meth:`to_json`; a ``ValueError`` for any other file, a damaged one, or another format version."""
         content = read_json(path, _FORMAT, _FORMAT_VERSION)
         try:
             return cls.of_mapping(content["constants"])
@@ -205,25 +202,23 @@ class CellParameters:
     @classmethod
     def of_mapping(cls, constants: Mapping[str, Any]) -> CellParameters:
         """
-        Constants by name, as JSON holds them.
+        Make the constants from a mapping, as JSON holds them.
 
-        :param constants: every one of them
-        :raises TypeError: for what is no mapping, or a value of another kind
+        :param constants: all constants, by name
+        :raises TypeError: if ``constants`` is no mapping, or a value has another type
         :raises ValueError: for a constant that is missing, unknown or out of range
         """
         if not isinstance(constants, Mapping):
             raise TypeError(f"constants must be given by name, got {type(constants).__name__}")
-        wrong = {field.name for field in fields(cls)} ^ set(constants)
-        if wrong:
-            raise ValueError(f"constants that are missing or unknown: {', '.join(sorted(map(str, wrong)))}")
-        lists = {name: tuple(constants[name]) for name in ("An", "Ap")}
-        return cls(**{**constants, **lists})
+        mismatched = {field.name for field in fields(cls)} ^ set(constants)
+        if mismatched:
+            raise ValueError(f"constants that are missing or unknown: {', '.join(sorted(map(str, mismatched)))}")
+        coefficients = {name: tuple(constants[name]) for name in ("An", "Ap")}
+        return cls(**{**constants, **coefficients})
 
     @cached_property
     def packed(self) -> PackedConstants:
-        """
-        What the compiled kernels read: one row of constants of the equations, and both equilibrium-potential polynomials.
-        """
+        """Return the input of the compiled kernels, with one row of constants."""
         volume_surface = self.VolSFraction * self.Vol
         constants = np.empty((1, CONSTANTS_SIZE))
         row = constants[0]
@@ -244,8 +239,8 @@ class CellParameters:
 
     def packed_with(self, factors: FloatArray) -> PackedConstants:
         """
-        Constants of many cells, one row each, that differ from this one in what is known least: ``UNCERTAIN_CONSTANTS`` are
-        multiplied by factors of shape (n, 4).
+        Return the constants of many cells, one row each: this cell's, ``UNCERTAIN_CONSTANTS`` multiplied by ``factors``, shape
+        (n, 4).
         """
         packed = self.packed
         constants = np.repeat(packed.constants, len(factors), axis=0)
@@ -260,21 +255,21 @@ class CellParameters:
 
 #: The new cell: every constant at its default.
 NEW_CELL = CellParameters()
-#: The charge that can move is about this much more than what a discharge delivers.
-UNDELIVERED = 1.05
-# A cell that holds less or more than the new one by this factor is one of another size.
-_OTHER_SIZE = 2.0
+#: Ratio of the charge that can move to the charge that a discharge delivers, roughly.
+Q_MOBILE_PER_CAPACITY = 1.05
+# A cell is of another size if its charge differs from the new cell's by more than this factor.
+_SAME_SIZE_FACTOR = 2.0
 
 
 def rest_shares(soc: float = 1.0) -> FloatArray:
-    """The charges of a cell at rest, as shares of ``q_mobile``."""
+    """Return the charges of a cell at rest, as shares of ``q_mobile``."""
     if not isinstance(soc, Real) or not 0.0 <= soc <= 1.0:
         raise ValueError(f"a state of charge must lie within 0 .. 1, got {soc!r}")
-    return FULL_CHARGE_SHARES - (1.0 - float(soc)) * _DRAWN_SHARES
+    return FULL_CHARGE_SHARES - (1.0 - float(soc)) * _DISCHARGE_SHARES
 
 
 def check_cell(cell: CellParameters | None, thermal: bool = False) -> CellParameters:
-    """Refuse what is no cell."""
+    """Refuse a ``cell`` that is no :class:`CellParameters`."""
     if cell is not None and not isinstance(cell, CellParameters):
         raise TypeError(f"cell must be CellParameters or None, got {cell!r}")
     if not isinstance(thermal, (bool, np.bool_)):
@@ -294,9 +289,9 @@ def check_dt(dt: float, cell: CellParameters) -> float:
 
 
 def new_cell_of(q_mobile_C: float) -> CellParameters:
-    """A new cell that holds so much: an 18650 within a factor of two, else one whose surfaces and mass go with its charge."""
+    """Return a new cell of this charge: an 18650 within a factor of two; otherwise surfaces and mass scale with the charge."""
     size = q_mobile_C / NEW_CELL.q_mobile
-    if 1.0 / _OTHER_SIZE < size < _OTHER_SIZE:
+    if 1.0 / _SAME_SIZE_FACTOR < size < _SAME_SIZE_FACTOR:
         return NEW_CELL
     surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
     return NEW_CELL.replace(q_mobile=q_mobile_C, r_o=NEW_CELL.r_o / size, **surfaces)

@@ -1,4 +1,4 @@
-"""Another equilibrium voltage: what is added to that of a cell, as a polynomial of the charge."""
+"""Changes of a cell's equilibrium voltage: a polynomial of the charge that is added to it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from numpy.polynomial.legendre import legvander
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry.cell import CellParameters
 
-# Mole fractions of the positive electrode at full charge and at none.
+# Mole fractions of the positive electrode at full charge and at zero charge.
 _FRACTIONS_P = (0.4, 1.0)
 
 
 def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | FloatArray) -> CellParameters:
     """
-    A cell with another equilibrium voltage, which ``U0p`` and ``Ap`` can make exactly. What is added is given by coefficients
-    of Legendre polynomials 0, 1, ... over the mole fractions of the positive electrode that a discharge passes through, V.
+    Add Legendre polynomials 0, 1, ... with these coefficients, V, exactly to the equilibrium voltage of a cell: by ``U0p`` and
+    ``Ap``. Their variable spans the mole fractions of the positive electrode in a discharge.
     """
-    # as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
+    # the sum as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
     # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
     powers = np.asarray(coefficients_V, dtype=np.float64) @ _powers(len(coefficients_V))
     terms = np.zeros(max(len(cell.Ap), len(powers) - 1))
@@ -36,20 +36,18 @@ def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | Flo
 
 @cache
 def _powers(count: int) -> FloatArray:
-    # of y = 2x - 1 in each of the first Legendre polynomials, shape (count, count)
+    # coefficients of the powers of y = 2x - 1 in each of the first Legendre polynomials, shape (count, count)
     x = Polynomial([0.5, 0.5])
     rows = [Legendre.basis(k).convert(kind=Polynomial)(on_unit_range(x)).coef for k in range(count)]
     return np.array([np.append(row, np.zeros(count - len(row))) for row in rows])
 
 
 def equilibrium_slopes(fraction_p: FloatArray, count: int) -> FloatArray:
-    """
-    The derivatives of the voltage by these coefficients at some mole fractions of the positive electrode, shape (count, K).
-    """
+    """Return the derivatives of the voltage by these coefficients at K mole fractions, shape (count, K)."""
     return np.asarray(legvander(on_unit_range(fraction_p), count - 1).T)
 
 
 def on_unit_range(fraction: Any) -> Any:
-    """Mole fractions of the positive electrode as -1 .. 1: numbers, arrays and polynomials alike."""
+    """Scale mole fractions of the positive electrode (numbers, arrays or polynomials) to -1 .. 1."""
     low, high = _FRACTIONS_P
     return (fraction - 0.5 * (high + low)) * (2.0 / (high - low))

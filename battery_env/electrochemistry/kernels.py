@@ -1,11 +1,10 @@
 """
-The compiled kernels (numba) of the electrochemistry model; :mod:`battery_env.electrochemistry` is their public face and
-documents equations and units.
+The compiled kernels (numba) of the electrochemistry model; :mod:`battery_env.electrochemistry` documents equations and units.
 
 Scalar functions take whole arrays and a row, never a slice: making slices would cost more than the arithmetic. Batches are
 computed in blocks of cells, state by state instead of cell by cell, and in loops without branches, so that the compiler uses
-vector instructions. Both call the same arithmetic, whose every operation is exact to the bit by IEEE 754, so that a cell comes
-out the same alone, in a batch of any size, and on any machine.
+vector instructions. Both call the same arithmetic. IEEE 754 defines every operation of it to the bit, so that the result of a
+cell does not depend on the size of the batch or on the machine.
 
 ``constants`` has one row that all cells share, or in a batch one row a cell.
 """
@@ -45,8 +44,8 @@ from battery_env.electrochemistry.cell import (
     PackedConstants,
 )
 
-#: The extended model holds mole fractions this far inside 0 .. 1, and the voltage that turns power into current above this;
-#: no discharge comes to either above the cut-off.
+#: The extended model holds mole fractions this far from 0 and 1, and the voltage that turns power into current above a floor;
+#: no discharge above the cut-off reaches either limit.
 MOLE_FRACTION_MARGIN = 1e-3
 _VOLTAGE_FLOOR_V = 1.0
 
@@ -60,20 +59,19 @@ _LN_2_HIGH, _LN_2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _L1, _L2, _L3, _L4 = 6.666666666666735130e-01, 3.999999999940941908e-01, 2.857142874366239149e-01, 2.222219843214978396e-01
 _L5, _L6, _L7 = 1.818357216161805012e-01, 1.531383769920937332e-01, 1.479819860511658591e-01
 
-#: A block of cells is one array: rows of this many values, of states, of what else a step needs, and of constants. Rows start
-#: at multiples that the compiler knows, so that it sees that they do not overlap.
+#: A block of cells is one array with rows of this many values: states, inputs of a step, and constants. Rows start at constant
+#: multiples, so that the compiler can tell that they do not overlap.
 BLOCK = 64
 LOAD, _Q, _R_O, _XN, _XP, _VOLTAGE, _CONSTANTS = range(STATE_SIZE, STATE_SIZE + 7)
-#: Where the voltages of a block start, and how long a block is; ``LOAD`` is the row of the loads, and of the currents after a
-#: step.
+#: Start of the voltages in a block, and its length; ``LOAD`` is the row of the loads, and of the currents after a step.
 VOLTAGE, BLOCK_SIZE = _VOLTAGE * BLOCK, (_CONSTANTS + CONSTANTS_SIZE) * BLOCK
 
 
 @inlined
 def logarithm(x: float) -> float:
-    # ln(x) within 1 ulp for x >= 2.3e-308, in operations that exist as vector instructions; the C library's has branches, and
-    # differs from machine to machine. With that one a step of BatteryQmax takes 1.05 times as long in 16 cells, 1.09 times in
-    # 64 and 1.4 to 1.5 times in 1024
+    # ln(x) within 1 ulp for x >= 2.3e-308, in operations that exist as vector instructions. The C library's logarithm has
+    # branches, and differs between machines. With the C library's a step of BatteryQmax takes 1.05 times as long in 16 cells,
+    # 1.09 times in 64 and 1.4 to 1.5 times in 1024
     bits = np.float64(x).view(np.uint64)
     exponent = np.uint64((bits + _ONE_OVER_ROOT_OF_HALF) >> _MANTISSA_BITS)
     k = np.uint64(exponent | _TWO_TO_THE_52).view(np.float64) - (2.0**52 + 1023.0)
@@ -117,19 +115,19 @@ def _fraction(share: float, charge: float, extended: bool) -> float:
 
 @inlined
 def _has_voltage(xn: float, xp: float) -> bool:
-    # an empty or overfull electrode has none
+    # an empty or overfull electrode has no voltage
     return (xn > 0.0) & (xn < 1.0) & (xp > 0.0) & (xp < 1.0)
 
 
 @inlined
 def nernst_logarithm(xn: float, xp: float) -> float:
-    # of both Nernst terms at once, which R * Tb / F makes a voltage
+    # the sum of both Nernst terms, in units of R * Tb / F
     return logarithm((1.0 - xp) * xn / (xp * (1.0 - xn)))
 
 
 @inlined
 def diffusion(bulk: float, surface: float, bulk_rate: float, surface_rate: float) -> float:
-    # from the bulk to the surface of an electrode
+    # the current from the bulk to the surface of an electrode
     return bulk * bulk_rate - surface * surface_rate
 
 
@@ -141,7 +139,7 @@ def _equilibrium(xn: float, xp: float, tb: float, gas: float, u0: float, poly_n:
 
 @inlined
 def _current(load: float, voltage: float, extended: bool) -> float:
-    # of a load that is power
+    # the current of a power load
     if extended:
         return load / (_VOLTAGE_FLOOR_V if voltage < _VOLTAGE_FLOOR_V else voltage)
     return load / voltage if voltage > 0.0 else np.nan
@@ -149,7 +147,7 @@ def _current(load: float, voltage: float, extended: bool) -> float:
 
 @inlined
 def _overpotential(i: float, x: float, scale: float, per_current: float) -> float:
-    # what Vsn or Vsp relaxes to: Butler-Volmer with alpha = 1/2, J0 = k * sqrt(x * (1 - x)); scale: 2 * R * Tb / F
+    # steady state of Vsn or Vsp: Butler-Volmer with alpha = 1/2, J0 = k * sqrt(x * (1 - x)); scale: 2 * R * Tb / F
     return scale * asinh_ratio(i * per_current, (1.0 - x) * x)
 
 
@@ -269,7 +267,7 @@ def fill_block(
     r_o: FloatArray,
     constants: FloatArray,
 ) -> None:
-    # Take ``cells`` cells, from row ``first`` on, into a block of shape (BLOCK_SIZE,); the first block is the largest
+    # Copy ``cells`` cells, from row ``first`` on, into a block of shape (BLOCK_SIZE,); the first block is the largest
     for j in range(cells):
         n = first + j
         for k in range(STATE_SIZE):
@@ -289,7 +287,7 @@ def fill_block(
 
 @compiled
 def voltage_of_block(block: FloatArray, cells: int, extended: bool, poly_n: FloatArray, poly_p: FloatArray) -> None:
-    # the voltages are in block[VOLTAGE : VOLTAGE + cells] then
+    # write the voltages into block[VOLTAGE : VOLTAGE + cells]
     _fractions_of_block(block, cells, extended)
     for j in range(cells):
         xn, xp = block[_XN * BLOCK + j], block[_XP * BLOCK + j]
@@ -319,7 +317,7 @@ def step_of_block(
     poly_n: FloatArray,
     poly_p: FloatArray,
 ) -> None:
-    # the states are in the first eight rows of the block; if asked for (as power asks), the voltages before the step in theirs
+    # advance the states in the first eight rows; with ``voltage`` (a power load needs it) write the voltages before the step
     if voltage:
         voltage_of_block(block, cells, extended, poly_n, poly_p)
     else:
@@ -415,7 +413,7 @@ def advance_batch(
     thermal: bool,
     packed: PackedConstants,
 ) -> None:
-    # the cells with most steps come first, so that those of a block that are still on their way are always its first ones
+    # the cells with most steps come first, so that the running cells of a block are always its first ones
     block = np.empty(BLOCK_SIZE)
     for start in range(0, state.shape[0], BLOCK):
         cells = running = min(BLOCK, state.shape[0] - start)
@@ -442,9 +440,9 @@ def roll_out(
     state: FloatArray,
     columns: FloatArray,
 ) -> int:
-    # Fills columns, the voltage and the current at each sample, shape (2, samples), up to the last one whose voltage is a
-    # number and at least the cut-off; returns how many they are. state has one row more, and its row 0 is the start. The
-    # condition is written so that NaN ends the discharge too: near its end V can fall from 3.3 V to NaN in one step.
+    # Fill columns, the voltage and the current at each sample, shape (2, samples), up to the last sample whose voltage is a
+    # number and at least the cut-off; return the number of samples. state has one row more, and its row 0 is the start. NaN
+    # must end the discharge too, hence "not >=": near its end V can fall from 3.3 V to NaN in one step.
     voltage, current = columns[0], columns[1]
     for k in range(load.shape[0]):
         voltage[k] = cell_voltage(state, k, q, False, packed)

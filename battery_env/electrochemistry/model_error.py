@@ -1,4 +1,4 @@
-"""How the error of the model drifts along a discharge: how many independent errors the charge of one shows."""
+"""The drift of the model error along a discharge: the number of its independent errors per charge."""
 
 from __future__ import annotations
 
@@ -6,24 +6,23 @@ from collections.abc import Mapping
 
 from battery_env.compiled import compiled
 
-#: The error of the model is this many times ``mismatch_V`` before ``q_mobile`` and ``r_o`` absorb their shares, which come out
-#: under another load: with those that ``fit_cell`` finds of B0005 a new 18650's constants miss its voltage by 81 to 102 mV.
-WHOLE_ERROR = 2.0
-#: So many independent errors the charge of a whole discharge shows beside a first one, by who asks:
+#: Ratio of the model error to ``mismatch_V`` before ``q_mobile`` and ``r_o`` absorb their shares, which reappear under another
+#: load: with the parameters that ``fit_cell`` gives B0005, a new 18650's constants miss its voltage by 81 to 102 mV.
+UNFITTED_ERROR_RATIO = 2.0
+#: Number of independent model errors in a whole discharge, in addition to a first one, by purpose:
 #:
-#: - ``forecast``: the model is wrong in another way at another charge, as fast as the residuals of whole discharges of B0005
-#:   lose their correlation
-#: - ``fit``: what is left of a fit of the constants drifts faster
-#: - ``path``: as does the error of a cell at its place along a path of aging cells. Chosen on B0005 along the path of B0006
-MORE_ERRORS: Mapping[str, float] = {"forecast": 1.0 / 0.15, "fit": 49.0, "path": 100.0}
+#: - ``forecast``: the residuals of whole discharges of B0005 lose their correlation at this rate
+#: - ``fit``: the residuals of a fit of the constants drift faster
+#: - ``path``: the error of a cell at its place along an aging path drifts faster too. Chosen on B0005 along the path of B0006
+ERRORS_PER_DISCHARGE: Mapping[str, float] = {"forecast": 1.0 / 0.15, "fit": 49.0, "path": 100.0}
 
 
 @compiled
-def independent_errors(charge_C: float, more_per_C: float) -> float:
-    """How many independent errors of the model a charge shows."""
-    return 1.0 + more_per_C * charge_C
+def independent_errors(charge_C: float, errors_per_C: float) -> float:
+    """Return the number of independent model errors in a charge."""
+    return 1.0 + errors_per_C * charge_C
 
 
-def memory_share(asked_by: str) -> float:
-    """The share of ``q_mobile`` over which the error of the model loses its memory."""
-    return 1.0 / MORE_ERRORS[asked_by]
+def correlation_share(purpose: str) -> float:
+    """Return the correlation length of the model error, as a share of ``q_mobile``."""
+    return 1.0 / ERRORS_PER_DISCHARGE[purpose]

@@ -29,10 +29,10 @@ from battery_env.parameters import Q_MOBILE, R_O
 _MAX_STEPS = 1e8  # of one simulation, in memory
 
 
-def _aged(
+def _checked_parameters(
     cell: CellParameters | None, q_mobile: ArrayLike | None, r_o: ArrayLike | None = None, thermal: bool = False
 ) -> tuple[CellParameters, FloatArray, FloatArray]:
-    """What was given of a cell, checked: its constants, and its age, which is that of the constants where it is not given."""
+    """Check a cell and its parameters; a parameter that is ``None`` is the cell's."""
     constants = check_cell(cell, thermal)
     q = constants.q_mobile if q_mobile is None else q_mobile
     return constants, Q_MOBILE.check(q), R_O.check(constants.r_o if r_o is None else r_o)
@@ -48,7 +48,7 @@ def initial_state(q_mobile: ArrayLike | None = None, cell: CellParameters | None
     :return: state, shape (..., 8)
     :raises ValueError: if ``q_mobile`` or ``soc`` is out of range
     """
-    constants, q, _ = _aged(cell, q_mobile)
+    constants, q, _ = _checked_parameters(cell, q_mobile)
     state = np.zeros((*q.shape, STATE_SIZE))
     state[..., TB] = constants.Tb0
     state[..., QNB:] = q[..., None] * rest_shares(soc)
@@ -76,7 +76,7 @@ def voltage(state: ArrayLike, q_mobile: ArrayLike | None = None, cell: CellParam
     :return: voltage in V, shape (...); NaN where an electrode is empty or overfull
     :raises ValueError: for a wrong shape, or ``q_mobile`` out of range
     """
-    constants, q, _ = _aged(cell, q_mobile)
+    constants, q, _ = _checked_parameters(cell, q_mobile)
     x = _check_state(state)
     shape = np.broadcast_shapes(x.shape[:-1], q.shape)
     out = np.empty(int(np.prod(shape)))
@@ -110,7 +110,7 @@ def step(
     :return: the next state, shape (..., 8)
     :raises ValueError: for a wrong shape, or a value out of range
     """
-    constants, q, r = _aged(cell, q_mobile, r_o, thermal)
+    constants, q, r = _checked_parameters(cell, q_mobile, r_o, thermal)
     x, u = _check_state(state), check_load(load, load_unit)
     shape = np.broadcast_shapes(x.shape[:-1], u.shape, q.shape, r.shape)
     out = np.empty((int(np.prod(shape)), STATE_SIZE))
@@ -134,9 +134,9 @@ def advance_in_place(
     """Advance every cell by its own number of steps under its own stretch of ``load``, unchecked."""
     order = np.argsort(-steps)
     ordered = packed if len(packed.constants) == 1 else packed._replace(constants=packed.constants[order])
-    ahead, power = state[order], load_unit == "power"
-    advance_batch(ahead, load, first[order], steps[order], q_mobile[order], r_o[order], dt, power, thermal, ordered)
-    state[order] = ahead
+    ordered_state, power = state[order], load_unit == "power"
+    advance_batch(ordered_state, load, first[order], steps[order], q_mobile[order], r_o[order], dt, power, thermal, ordered)
+    state[order] = ordered_state
 
 
 def state_of_charge(state: FloatArray, q_mobile: FloatArray) -> FloatArray:
@@ -212,13 +212,13 @@ class Trajectory:
 
 
 def _loads(
-    load: float | ArrayLike | Callable[[FloatArray], ArrayLike], unit: LoadUnit, dt: float, most_samples: int
+    load: float | ArrayLike | Callable[[FloatArray], ArrayLike], unit: LoadUnit, dt: float, max_samples: int
 ) -> FloatArray:
-    """The load over the step that starts at each sample, an array of its own."""
-    given_unit = getattr(load, "unit", unit)
-    if given_unit != unit:
-        raise ValueError(f"the load is a {given_unit}, but load_unit is {unit!r}: give load_unit={given_unit!r}")
-    n_samples = most_samples
+    """Return the load over the step that starts at each sample, as a new array."""
+    load_unit = getattr(load, "unit", unit)
+    if load_unit != unit:
+        raise ValueError(f"the load is a {load_unit}, but load_unit is {unit!r}: give load_unit={load_unit!r}")
+    n_samples = max_samples
     if callable(load):
         values = check_numbers("load", load(dt * np.arange(n_samples, dtype=np.float64)))
     else:
@@ -269,7 +269,7 @@ def simulate(
     :return: the samples down to the cut-off, and the time of the end of discharge
     :raises ValueError: for a value out of range
     """
-    constants, q, r = _aged(cell, q_mobile, r_o, thermal)
+    constants, q, r = _checked_parameters(cell, q_mobile, r_o, thermal)
     dt = check_dt(dt, constants)
     if q.ndim or r.ndim:
         raise ValueError(f"q_mobile and r_o must be single numbers, got shapes {q.shape} and {r.shape}")
@@ -277,14 +277,14 @@ def simulate(
         raise ValueError(f"until must be a time in s, greater than 0 and at most {_MAX_STEPS:g} steps of dt, got {until!r}")
     loads = _loads(load, load_unit, dt, int(np.floor(until / dt + 1e-9)) + 1)
     n_samples = len(loads)
-    start = initial_state(q, constants) if initial is None else _check_state(initial)
-    if start.shape != (STATE_SIZE,):
-        raise ValueError(f"initial must have shape ({STATE_SIZE},), got {start.shape}")
+    initial_row = initial_state(q, constants) if initial is None else _check_state(initial)
+    if initial_row.shape != (STATE_SIZE,):
+        raise ValueError(f"initial must have shape ({STATE_SIZE},), got {initial_row.shape}")
     cut_off = constants.VEOD if cut_off_V is None else cut_off_V
     if not isinstance(cut_off, Real) or np.isnan(cut_off):
         raise ValueError(f"cut_off_V must be a number or None, got {cut_off_V!r}")
     state, columns, power = np.empty((n_samples + 1, STATE_SIZE)), np.empty((2, n_samples)), load_unit == "power"
-    state[0] = start
+    state[0] = initial_row
     n = roll_out(loads, float(q), float(r), dt, cut_off, power, thermal, constants.packed, state, columns)
     return Trajectory(
         time_s=dt * np.arange(n, dtype=np.float64),

@@ -1,4 +1,4 @@
-"""What every calibrator returns, and the findings against it."""
+"""Estimates, the results of calibrators, and the findings against them."""
 
 from battery_env.estimates.estimate import Estimate, EstimateTrace, last_estimate
 from battery_env.estimates.findings import Finding

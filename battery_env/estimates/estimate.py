@@ -70,13 +70,13 @@ class Estimate:
         :param high_C: largest ``q_mobile``, C
         :return: the estimate with the mean and the standard deviation of the logarithm of ``q_mobile`` in this range
         """
-        from scipy.stats import truncnorm  # here, as it takes long to import
+        from scipy.stats import truncnorm  # here, because the import takes long
 
         share = self.sd_q_mobile / self.q_mobile
         if not 0.0 < share < np.inf:
             return self
-        ends = np.log([low_C / self.q_mobile, high_C / self.q_mobile]) / share
-        mean, variance = (float(each) for each in truncnorm.stats(*ends))
+        limits = np.log([low_C / self.q_mobile, high_C / self.q_mobile]) / share
+        mean, variance = (float(moment) for moment in truncnorm.stats(*limits))
         q_mobile = float(np.clip(self.q_mobile * np.exp(share * mean), low_C, high_C))
         return replace(self, q_mobile=q_mobile, sd_q_mobile=q_mobile * share * sqrt(max(variance, 0.0)))
 
@@ -90,22 +90,22 @@ _COLUMNS = (
 @dataclass(frozen=True)
 class EstimateTrace:
     """
-    The estimates of one discharge in the order they were made, arrays of shape (K,), K >= 1, with the units of
-    :class:`Estimate`. What the calibrator does not say is ``None``.
+    The estimates over one discharge, arrays of shape (K,), K >= 1, with the names and units of :class:`Estimate`. ``None``:
+    the calibrator does not state it.
 
-    :param time_s: time of the last sample that each estimate has seen, s
+    :param time_s: time of the last sample of each estimate, s
     :param q_mobile: C
     :param r_o: ohm
-    :param sd_q_mobile: stated standard deviations, C
-    :param sd_r_o: likewise, ohm
-    :param settled: whether the calibrator takes each estimate for settled
-    :param findings: why each is not, empty for those that are
-    :param settled_q_mobile: whether it takes each ``q_mobile`` for settled
-    :param settled_r_o: likewise
-    :param resistance_10s_ohm: as of :class:`Estimate`
-    :param sd_resistance_10s_ohm: likewise
-    :param settled_resistance_10s: likewise
-    :param constants: what else was found with each, as of :class:`Estimate`
+    :param sd_q_mobile: C
+    :param sd_r_o: ohm
+    :param settled: whether each estimate is settled
+    :param findings: the findings against each estimate, empty if it is settled
+    :param settled_q_mobile: whether each ``q_mobile`` is settled
+    :param settled_r_o: whether each ``r_o`` is settled
+    :param resistance_10s_ohm: ohm
+    :param sd_resistance_10s_ohm: ohm
+    :param settled_resistance_10s: whether each ``resistance_10s_ohm`` is settled
+    :param constants: the other constants of each estimate
     """
 
     time_s: FloatArray
@@ -124,7 +124,7 @@ class EstimateTrace:
 
     @classmethod
     def of(cls, time_s: Sequence[float] | FloatArray, estimates: Sequence[Estimate]) -> EstimateTrace:
-        """A trace of single estimates, and the time of the last sample that each has seen, s."""
+        """Make a trace of single estimates, and the times of their last samples, s."""
         names = (*_COLUMNS, "settled")
         columns: dict[str, Any] = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in names}
         constants = None if estimates[-1].constants is None else [estimate.constants for estimate in estimates]
@@ -133,13 +133,13 @@ class EstimateTrace:
 
     @property
     def reason(self) -> StringArray | None:
-        """The findings of each as one text."""
-        return None if self.findings is None else np.array([reason_of(each) for each in self.findings], dtype=object)
+        """The findings of each estimate as one text."""
+        return None if self.findings is None else np.array([reason_of(findings) for findings in self.findings], dtype=object)
 
 
 def last_estimate(trace: EstimateTrace) -> Estimate:
-    """The last estimate of a trace that states uncertainties and what is settled."""
+    """Return the last estimate of a trace with standard deviations and verdicts."""
     assert trace.findings is not None
     constants = None if trace.constants is None else trace.constants[-1]
-    columns: dict[str, Any] = {name: each[-1].item() for name in _COLUMNS if (each := getattr(trace, name)) is not None}
+    columns: dict[str, Any] = {name: column[-1].item() for name in _COLUMNS if (column := getattr(trace, name)) is not None}
     return Estimate(**columns, findings=trace.findings[-1], constants=constants)

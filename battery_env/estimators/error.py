@@ -13,7 +13,7 @@ import numpy as np
 from battery_env.arrays import FloatArray
 from battery_env.compiled import compiled
 from battery_env.records import SWITCH_SHARE
-from battery_env.records.load import followed_current_A, moment_sd_s, switched_charge
+from battery_env.records.load import lagged_current_A, switch_time_sd_s, switched_charge
 
 # Real ohmic drops follow a current at once in part, where that of the model lags: this share of what lags is in doubt.
 _LATE_SHARE = 0.1
@@ -58,6 +58,7 @@ class ErrorModel:
     :param memory_C: the charge along which the drift loses its memory
     :param load_on_C: the charge that is in doubt between the first sample, at rest, and the second, under load
     :param dropouts_s: spans of time since the first sample in which the voltage is not that of the current, s
+    :param first_noise_V: the noise of the first sample; ``None``: as of all samples
     """
 
     drift_V: float = 0.0
@@ -67,6 +68,7 @@ class ErrorModel:
     memory_C: float = 1.0
     load_on_C: float = 0.0
     dropouts_s: tuple[tuple[float, float], ...] = ()
+    first_noise_V: float | None = None
 
     def along(self, time_s: FloatArray, current_A: FloatArray) -> VoltageError:
         """
@@ -75,6 +77,8 @@ class ErrorModel:
         doubt, and what the moment of the switch, between two samples, makes of it.
         """
         noise_V = np.full(len(time_s), self.noise_V)
+        if self.first_noise_V is not None:
+            noise_V[0] = self.first_noise_V
         for begin_s, end_s in self.dropouts_s:
             noise_V[(time_s >= begin_s) & (time_s < end_s)] = inf
         if self.drift_V == 0.0:
@@ -89,10 +93,10 @@ class ErrorModel:
         # rows may meet a load that is switched again and again at the same place each time: then these errors go together
         switched = switched_charge(time_s, current_A)
         together = switched.sd_C / switched.independent_sd_C if switched.independent_sd_C else 1.0
-        moment_share = np.minimum(together * moment_sd_s(interval_s) / self.to, 1.0)
+        moment_share = np.minimum(together * switch_time_sd_s(interval_s) / self.to, 1.0)
         moment_sd_A = np.where(changed_A > SWITCH_SHARE * most_A, changed_A * moment_share, 0.0)
         # the first sample is at rest, whatever current follows it
-        late_A = _LATE_SHARE * (current_A - followed_current_A(time_s, current_A, self.to))[1:]
+        late_A = _LATE_SHARE * (current_A - lagged_current_A(time_s, current_A, self.to))[1:]
         late_V = self.r_o * np.hypot(late_A, _fading(moment_sd_A, np.exp(-interval_s / self.to)))
         return VoltageError(np.append(0.0, way), self.drift_V, np.hypot(noise_V, np.append(0.0, late_V)))
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_numbers
 from battery_env.electrochemistry import LoadUnit, voltage
-from battery_env.electrochemistry.ends import LONGEST_S, Cells, run_down
+from battery_env.electrochemistry.ends import LONGEST_S, Cells, simulate_to_cut_off
 from battery_env.estimates import Estimate, EstimateTrace, last_estimate
 from battery_env.estimators.state_files import Saved
 from battery_env.loads import KnownLoad, Load, known_load
@@ -128,7 +128,7 @@ class OnlineEstimator(Saved, Estimator):
         starts_s = model.dt_s * np.arange(len(values), dtype=np.float64)
         given_s = len(values) * model.dt_s if len(values) else np.inf
         given = Load(starts_s, values, load_unit) if len(values) else known_load(load, load_unit)
-        (end_s,) = run_down(cell, model, [given], model.cell.VEOD if cut_off_V is None else cut_off_V).time_s
+        (end_s,) = simulate_to_cut_off(cell, model, [given], model.cell.VEOD if cut_off_V is None else cut_off_V).time_s
         if given_s < min(end_s, LONGEST_S):
             raise ValueError(
                 f"load ends after {given_s:g} s, before the discharge does. Append what is to come, or "

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
-from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, PATH_NAMES, AgingPath
-from battery_env.electrochemistry.model_error import WHOLE_ERROR, independent_errors, memory_share
+from battery_env.electrochemistry.aging_path import PATH_DISTANCE_LIMIT_SD, PATH_NAMES, AgingPath
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO, correlation_share, independent_errors
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimates.findings import Reason
@@ -33,8 +33,8 @@ from battery_env.estimators.search import (
     Prior,
     Search,
     SizePrior,
-    root_inverse_diagonal,
     square,
+    standard_deviations,
 )
 from battery_env.estimators.verdict import (
     PRIOR_LIMIT_SD,
@@ -68,10 +68,20 @@ _SOC_STEP = 1e-3
 _STARTS_SD, _START_ABOVE = (-1.5, -0.5, 0.5, 1.5), 0.02
 
 
-@dataclass(frozen=True)
-class _Fitted:
-    """What the search says of a record, and how sure that is."""
+class Alternative(NamedTuple):
+    """A cell that a record leaves open: its model, ``q_mobile``, C, and ``r_o``, ohm."""
 
+    model: RecordModel
+    q_mobile: float
+    r_o: float
+
+
+@dataclass(frozen=True)
+class RecordFit:
+    """What the search says of a record, and how sure that is (:meth:`LeastSquares.fit`)."""
+
+    record: Samples
+    history: ChargeHistory
     search: Search
     fit: Fit  # with all priors
     alone: Fit  # without the prior of q_mobile
@@ -82,11 +92,30 @@ class _Fitted:
     def sd(self, fit: Fit, ratios: Mapping[str, float]) -> dict[str, float]:
         """The standard deviations of a fit, so many times as large as it says, with those of what does not show."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
-        for name, root in zip(self.search.parameters, root_inverse_diagonal(fit.jacobian), strict=False):
+        for name, root in zip(self.search.parameters, standard_deviations(fit.jacobian), strict=False):
             ratio = ratios.get(name, 1.0) * (fit.spread if name == "q_mobile" else 1.0)
             knee_sd_C = fit.knee_sd_C if name == "q_mobile" else 0.0
             sd[name] = hypot(ratio * sqrt(self.variance) * float(root), self.hidden_sd[name], knee_sd_C)
         return sd
+
+    def alternatives(self) -> list[Alternative]:
+        """
+        The cell that fits best; and those a standard deviation to each side, in each direction in which all unknowns are open.
+        """
+        fit, names = self.fit, self.search.unknown
+        roots = np.linalg.cholesky(self.variance * np.linalg.pinv(fit.jacobian.T @ fit.jacobian, hermitian=True)).T
+        cells = [fit.values]
+        cells += [
+            fit.values | {n: fit.values[n] + float(move) for n, move in zip(names, row, strict=True)}
+            for row in (*roots, *-roots)
+        ]
+        (least_C, most_C), (least_ohm, most_ohm) = Q_MOBILE.limits, R_O.limits
+        return [
+            Alternative(
+                self.search.model_at(at), min(max(at["q_mobile"], least_C), most_C), min(max(at["r_o"], least_ohm), most_ohm)
+            )
+            for at in cells
+        ]
 
 
 class _Resistance(NamedTuple):
@@ -95,14 +124,6 @@ class _Resistance(NamedTuple):
     ohm: float = nan
     sd_ohm: float = nan
     load_on_ohm: float = 0.0
-
-
-class Alternative(NamedTuple):
-    """A cell that a record leaves open: its model, ``q_mobile``, C, and ``r_o``, ohm."""
-
-    model: RecordModel
-    q_mobile: float
-    r_o: float
 
 
 class LeastSquares(Estimator):
@@ -228,7 +249,11 @@ class LeastSquares(Estimator):
         :return: the estimate
         :raises ValueError: if the record cannot be used, or the least ``q_mobile`` it allows is outside the bounds
         """
-        return self._estimate(self._samples(record), self._history(record))
+        return self.estimate_of(self.fit(record))
+
+    def fit(self, record: Record) -> RecordFit:
+        """The search of :meth:`estimate`, which also says what other cells a record leaves open."""
+        return self._fit(self._samples(record), self._history(record))
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -253,7 +278,7 @@ class LeastSquares(Estimator):
         estimates: list[Estimate] = []
         for stop in stops:
             previous = estimates[-1] if estimates else None
-            estimates.append(self._estimate(whole.first(stop), self._history(record), previous))
+            estimates.append(self.estimate_of(self._fit(whole.first(stop), self._history(record), previous)))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
     def _samples(self, record: Record) -> Samples:
@@ -263,29 +288,6 @@ class LeastSquares(Estimator):
         # where another charge is stated, that before the load does not count
         history = history_of(record, self.usual_start)
         return history if self.initial_soc[0] == 1.0 else history._replace(charge=None)
-
-    def alternatives(self, record: Record) -> list[Alternative]:
-        """
-        The cell that fits best to a record; and those a standard deviation to each side, in each direction in which all
-        unknowns are open. A ``ValueError`` as of :meth:`estimate`.
-        """
-        samples = self._samples(record)
-        search, starts = self._search(samples)
-        fitted = self._fitted(samples, search, starts, self._history(record))
-        fit, names = fitted.fit, fitted.search.unknown
-        roots = np.linalg.cholesky(fitted.variance * np.linalg.pinv(fit.jacobian.T @ fit.jacobian, hermitian=True)).T
-        found = [fit.values]
-        found += [
-            fit.values | {n: fit.values[n] + float(move) for n, move in zip(names, row, strict=True)}
-            for row in (*roots, *-roots)
-        ]
-        (least_C, most_C), (least_ohm, most_ohm) = Q_MOBILE.limits, R_O.limits
-        return [
-            Alternative(
-                search.model_at(at), min(max(at["q_mobile"], least_C), most_C), min(max(at["r_o"], least_ohm), most_ohm)
-            )
-            for at in found
-        ]
 
     def _search(self, record: Samples, previous: Estimate | None = None) -> tuple[Search, list[dict[str, float]]]:
         """The search in a record, and where to start it."""
@@ -299,12 +301,11 @@ class LeastSquares(Estimator):
             starts = search.starts([self.model.cell.q_mobile])[0]
         return search, starts
 
-    def _estimate(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> Estimate:
-        search, starts = self._search(record, previous)
-        fitted = self._fitted(record, search, starts, history)
+    def estimate_of(self, fitted: RecordFit) -> Estimate:
+        """The estimate of a record, from :meth:`fit`."""
         sd = fitted.sd(fitted.fit, dict.fromkeys(self.parameters, self._sd_ratio))
-        resistance = self._resistance(record, history, fitted, fitted.fit)
-        values, verdict = fitted.fit.values, self._verdict(record, history, fitted)
+        resistance = self._resistance(fitted, fitted.fit)
+        values, verdict = fitted.fit.values, self._verdict(fitted)
         constants = {name: values[name] for name in self.nuisance if name != "offset_V"} or None
         return Estimate(
             q_mobile=values["q_mobile"],
@@ -317,15 +318,16 @@ class LeastSquares(Estimator):
             constants=constants,
         )
 
-    def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]], history: ChargeHistory) -> _Fitted:
+    def _fit(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> RecordFit:
         """The best fits with and without the prior, and what their standard deviations are made of."""
+        search, starts = self._search(record, previous)
         noise_V, at_start_V = self.voltage_noise_V, search.residual(dict.fromkeys(self.nuisance, 0.0) | starts[0])[0]
         usual_C = self.usual_q_mobile_C
         if noise_V is None and (self.nuisance or self.mismatch_V or usual_C):  # what else is known is weighed against it
             noise_V = max(white_noise_V(at_start_V), _LEAST_NOISE_V)
         if self.path is None:
             priors: list[AnyPrior] = [Prior(name, 0.0, 1.0 / sd) for name, sd in self.nuisance.items()]
-            cell, drift_V = self.model.cell, WHOLE_ERROR * self.mismatch_V
+            cell, drift_V = self.model.cell, UNFITTED_ERROR_RATIO * self.mismatch_V
             if drift_V and noise_V and self._at_rest:  # it is no smaller than the voltage at rest shows, beyond noise
                 start_V2 = float(at_start_V[0]) ** 2 - (MOST_NOISE_SD * noise_V) ** 2 - self.mismatch_V**2
                 drift_V = hypot(drift_V, sqrt(max(start_V2, 0.0)))
@@ -334,7 +336,7 @@ class LeastSquares(Estimator):
                 noise_V or 1.0,
                 cell.r_o,
                 cell.to,
-                memory_share("forecast") * starts[0]["q_mobile"],
+                correlation_share("forecast") * starts[0]["q_mobile"],
                 history.load_on_C,
                 tuple((each.begin_s, each.end_s) for each in dropouts_of(record, cell)),
             )
@@ -370,20 +372,21 @@ class LeastSquares(Estimator):
             fit = search.best([alone.values, *search.starts([mean_C])[0]], [*priors, carried])
             fit = replace(fit, spread=search.spread(fit, [*priors, carried], variance))
         evidence = self._evidence(record, history, fit)
-        return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, evidence.unseen_C), evidence)
+        hidden_sd = self._hidden_sd(search, fit, evidence.sd_charge_C)
+        return RecordFit(record, history, search, fit, alone, variance, hidden_sd, evidence)
 
     def _evidence(self, record: Samples, history: ChargeHistory, fit: Fit) -> Evidence:
         """What the samples of a record show, with a fit."""
         estimate, soc = [fit.values[name] for name in PARAMETER_NAMES], self.initial_soc[0] if self._at_rest else None
         return evidence_of(record, self.model.cell, soc, estimate, history, _model_V(record, fit))
 
-    def _hidden_sd(self, search: Search, fit: Fit, unseen_C: float) -> dict[str, float]:
+    def _hidden_sd(self, search: Search, fit: Fit, sd_charge_C: float) -> dict[str, float]:
         """
         The standard deviations of what does not show in the voltage: the gain of the current sensor, which scales both
         parameters, and the charge at the start, which the fit makes up for. A charge that nobody saw is like one of these.
         """
         (soc, sd_soc), values, model = self.initial_soc, fit.values, self.model
-        sd_soc = hypot(sd_soc, unseen_C / values["q_mobile"])
+        sd_soc = hypot(sd_soc, sd_charge_C / values["q_mobile"])
         by_soc = np.zeros(len(search.unknown))
         if sd_soc:
             step = _SOC_STEP if soc < 0.5 else -_SOC_STEP
@@ -405,8 +408,9 @@ class LeastSquares(Estimator):
             for n, name in enumerate(self.parameters)
         }
 
-    def _resistance(self, record: Samples, history: ChargeHistory, fitted: _Fitted, fit: Fit) -> _Resistance:
+    def _resistance(self, fitted: RecordFit, fit: Fit) -> _Resistance:
         """The resistance after ten seconds of a fit; NaN where the record does not begin with a rest and a load that stays."""
+        record, history = fitted.record, fitted.history
         step = load_on(record, history.at_rest) if self._at_rest and self.parameters == PARAMETER_NAMES else None
         if step is None or not step.stays:
             return _Resistance()
@@ -415,8 +419,9 @@ class LeastSquares(Estimator):
         fit_ohm = self._sd_ratio * sqrt(fitted.variance) * found.sd_ohm
         return _Resistance(found.ohm, hypot(fit_ohm, load_on_ohm, self.current_gain_sd * found.ohm), load_on_ohm)
 
-    def _differing(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> dict[str, float]:
+    def _differing(self, fitted: RecordFit) -> dict[str, float]:
         """What was measured of a load whose voltage falls otherwise than that of the model; nothing where both agree."""
+        record, history = fitted.record, fitted.history
         # constants that are held, and may be wrong, explain a difference as well
         is_open = self.parameters == PARAMETER_NAMES and any(name in self.nuisance for name in RATE_CONSTANTS)
         step = (load_on(record, history.at_rest) or later_step(record)) if is_open else None
@@ -436,8 +441,9 @@ class LeastSquares(Estimator):
                 return {**found, "apart_sd": apart_ohm / sd_ohm}
         return {}
 
-    def _verdict(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> Verdict:
+    def _verdict(self, fitted: RecordFit) -> Verdict:
         """What speaks against an estimate."""
+        record, history = fitted.record, fitted.history
         fit, alone, evidence, (soc, sd_soc) = fitted.fit, fitted.alone, fitted.evidence, self.initial_soc
         diagnosis = Diagnosis(evidence, evidence.measured(soc, float(record.time_s[0]), history.charge))
         n, free, is_stated = len(fit.residual_V), self.parameters, self.voltage_noise_V is not None
@@ -450,16 +456,20 @@ class LeastSquares(Estimator):
         q_mobile = fit.values["q_mobile"]
         diagnosis.note(Reason.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, self.model.cell.q_mobile))
         if self.path is not None:
-            ratio = self.path.distance_sd(fit.values) / BESIDE_LIMIT_SD
+            ratio = self.path.distance_sd(fit.values) / PATH_DISTANCE_LIMIT_SD
             diagnosis.note(Reason.OTHER_KIND, ratio > 1.0, what="distance from the path of aging cells", ratio=ratio)
         moved = fit.square - alone.square
-        diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance)
-        differing = self._differing(record, history, fitted)
+        is_far = moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance
+        mean_C, sd_C = self.prior_q_mobile_C or (nan, nan)
+        expected_C = {"least_Ah": mean_C - PRIOR_LIMIT_SD * sd_C, "most_Ah": mean_C + PRIOR_LIMIT_SD * sd_C}
+        sizes_Ah = {name: size_C / 3600.0 for name, size_C in {"record_Ah": alone.values["q_mobile"], **expected_C}.items()}
+        diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, is_far, **sizes_Ah)
+        differing = self._differing(fitted)
         diagnosis.note(Reason.RESISTANCE_DIFFERS, bool(differing), **differing)
         for name in fit.at_bound:
             diagnosis.note_about(name, Reason.AT_BOUND)
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
-        resistance = self._resistance(record, history, fitted, alone)
+        resistance = self._resistance(fitted, alone)
         known = Assumptions(
             self.current_gain_sd,
             sd_soc / soc,

@@ -11,7 +11,7 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.estimators.search import Fit, Search, root_variance
-from battery_env.records import SWITCH_SHARE, Record, drawn, load_span, switches
+from battery_env.records import SWITCH_SHARE, Record, integrate_load, load_span, switches
 from battery_env.records.load import switch_times_s
 
 #: The time of the DC resistance in test reports, s.
@@ -110,7 +110,7 @@ def _moment_s(record: Record, before: int) -> float:
 
 def _step(record: Record, before: int, before_A: float, on_s: float) -> LoadStep | None:
     end_s, largest_A = on_s + PULSE_S, float(np.abs(record.current_A).max())
-    first_C, last_C = drawn(record.time_s, record.current_A, [on_s, end_s])
+    first_C, last_C = integrate_load(record.time_s, record.current_A, [on_s, end_s])
     size_A = float(last_C - first_C) / PULSE_S - before_A
     if end_s > record.time_s[-1] or not size_A > SWITCH_SHARE * largest_A:
         return None

@@ -80,23 +80,10 @@ def interruptible() -> Iterator[None]:
             signal.signal(signal.SIGTERM, before)
 
 
-class InThisProcess(Executor):
-    """Makes each call at once."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Make a call."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
 class Processes(ThreadPoolExecutor):
     """
     Makes calls in processes of this machine, one for each thread, which end with this one. A call whose process is lost is
-    made once more in a process of its own, so that it alone can be the reason.
+    made once more in a process of its own, so that it alone can be the reason. A single pool would end all calls under way.
     """
 
     def __init__(self, count: int) -> None:
@@ -150,23 +137,23 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
-    """What makes calls side by side: this process, so many of this machine (-1: one a core), or those of a Dask cluster."""
-    if scheduler is not None:
-        try:
-            from distributed import Client
-        except ImportError as error:
-            raise ImportError("--scheduler needs Dask: pip install './battery_env[cluster]'") from error
-        try:
-            # one that is there answers within milliseconds
-            client = Client(scheduler, timeout=5, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise OSError(f"no Dask scheduler at {scheduler!r}: {error}") from error
-        with client:
-            yield client.get_executor(pure=False)
-    else:
-        with InThisProcess() if jobs == 1 else Processes(jobs if jobs > 0 else os.cpu_count() or 1) as executor:
+def workers(jobs: int, scheduler: str | None = None) -> Iterator[Executor]:
+    """What makes calls side by side: so many processes of this machine (-1: one a core), or the workers of a Dask cluster."""
+    if scheduler is None:
+        with Processes(jobs if jobs > 0 else os.cpu_count() or 1) as executor:
             yield executor
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ImportError("--scheduler needs Dask: pip install './battery_env[cluster]'") from error
+    try:
+        # one that is there answers within milliseconds
+        client = Client(scheduler, timeout=5, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise OSError(f"no Dask scheduler at {scheduler!r}: {error}") from error
+    with client:
+        yield client.get_executor(pure=False)
 
 
 class Attempt(NamedTuple):
@@ -196,23 +183,27 @@ def _message(error: Exception) -> str:
     return text if isinstance(error, expected) and text else f"{type(error).__name__}: {text}"
 
 
-def _in_order(started: Iterable[tuple[_Call, Future[Attempt]]], ahead: int) -> Iterator[tuple[_Call, Attempt]]:
-    """What became of calls, in the order in which they are started, each when at most so many others are under way."""
+def _in_order(
+    function: Callable[..., Any], calls: Iterable[tuple[_Call, tuple[Any, ...]]], executor: Executor | None, ahead: int
+) -> Iterator[tuple[_Call, Attempt]]:
+    """What became of calls of a function, in their order, each when at most so many others are under way."""
+    if executor is None:
+        for call, arguments in calls:
+            yield call, attempt(function, *arguments)
+        return
     waiting: deque[tuple[_Call, Future[Attempt]]] = deque()
-
-    def first() -> tuple[_Call, Attempt]:
-        call, future = waiting.popleft()
-        try:
-            return call, future.result()
-        except Exception as error:  # the worker's
-            return call, Attempt(None, [], _message(error))
-
-    for each in started:
-        waiting.append(each)
+    for call, arguments in calls:
+        waiting.append((call, executor.submit(attempt, function, *arguments)))
         while waiting and (len(waiting) > ahead or waiting[0][1].done()):
-            yield first()
-    while waiting:
-        yield first()
+            yield _awaited(*waiting.popleft())
+    yield from (_awaited(*each) for each in waiting)
+
+
+def _awaited(call: _Call, future: Future[Attempt]) -> tuple[_Call, Attempt]:
+    try:
+        return call, future.result()
+    except Exception as error:  # the worker's
+        return call, Attempt(None, [], _message(error))
 
 
 @dataclass(frozen=True)
@@ -492,17 +483,15 @@ def calibrate_all(
     :param ahead: so many calls are under way at most beyond the one that is waited for, as each holds its data
     :return: in the order of the sources, but first what is done
     """
-    executor = executor or InThisProcess()
     with_voltages = results is not None and results.with_voltages
     done = results.done if results else []
     yield from done
     used = {each.record.casefold() for each in done}
     to_read = [source for source in sources if not (results and results.holds(source))]
-    reads = ((source, executor.submit(attempt, _read, source, file_format)) for source in to_read)
 
-    def calls() -> Iterator[tuple[_Place, Future[Attempt]]]:
+    def calls() -> Iterator[tuple[_Place, tuple[Any, ...]]]:
         starts: dict[str, str] = {}  # the latest in each folder
-        for source, read in _in_order(reads, ahead):
+        for source, read in _in_order(_read, ((source, (source, file_format)) for source in to_read), executor, ahead):
             start, folder = _start_of(read), os.path.dirname(source.key)
             latest = starts.setdefault(folder, start)
             if folder and start and start < latest:
@@ -511,13 +500,10 @@ def calibrate_all(
                 )
             starts[folder] = max(latest, start)
             for place, recording in _places(source, read, used):
-                name = place.known.record
-                if recording is None:
-                    yield place, InThisProcess().submit(Attempt, None, [], place.known.error)
-                elif not (results and results.holds(source, place.number)):
-                    yield place, executor.submit(attempt, _calibrate, name, recording, settings, with_voltages)
+                if recording is None or not (results and results.holds(source, place.number)):
+                    yield place, (place.known.record, recording, settings, with_voltages)
 
-    for place, made in _in_order(calls(), ahead):
+    for place, made in _in_order(_calibrate, calls(), executor, ahead):
         outcome, whole = (place.known, False) if place.known.error else _outcome(place.known, made, results)
         if results is not None:
             results.keep(outcome, place, whole)
@@ -569,8 +555,12 @@ def calibrate_recording(discharge: Discharge, recording: Recording, settings: Se
         raise error.of(recording.origin) from error
 
 
-def _calibrate(name: str, recording: Recording, settings: Settings, with_voltages: bool) -> tuple[Calibration, Attempt]:
-    """What the discharge says, and its voltages as files by their suffixes."""
+def _calibrate(
+    name: str, recording: Recording | None, settings: Settings, with_voltages: bool
+) -> tuple[Calibration, Attempt] | None:
+    """What the discharge says, and its voltages as files by their suffixes; ``None`` of a source that could not be read."""
+    if recording is None:
+        return None
     found = calibrate_recording(recording.discharge(), recording, settings)
     files = attempt(_voltages_of, name, found) if with_voltages else Attempt({}, [], "")
     return replace(found, record=None, forecast=None, end=None), files

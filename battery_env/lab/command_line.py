@@ -13,9 +13,8 @@ import re
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,7 +31,7 @@ from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.readers.testers import find_tester, tester_file
 from battery_env.lab.report import Calibration, change_of, line_of, text_of
-from battery_env.lab.settings import METHODS, Settings
+from battery_env.lab.settings import METHODS, Settings, SettingsOptions
 from battery_env.lab.sources import VOLTAGE, Source, few_of, find_sources, read_source
 from battery_env.loads import constant
 from battery_env.records import CUT_OFF_V
@@ -117,7 +116,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=METHODS,
         help="of calibration: least squares, or the policy that comes with the package (default: least squares)",
     )
-    _add_calibration(group)
+    _add_settings(group)
     group = parser.add_argument_group("results")
     group.add_argument(
         "--out", type=Path, metavar="DIR", help="write the table of estimates, the voltages and figures there, for one run"
@@ -193,7 +192,7 @@ def _forecast_parser() -> argparse.ArgumentParser:
         help="the load to come: time_s, from 0 at the last sample under load, and current_A or power_W, each held until the "
         "next (default: as so far)",
     )
-    _add_calibration(parser.add_argument_group("calibration"))
+    _add_settings(parser.add_argument_group("calibration"))
     group = parser.add_argument_group("results")
     group.add_argument("--out", type=Path, metavar="DIR", help="write a figure there, NAME_forecast.png; it may not exist")
     group.add_argument("--json", action="store_true", help="print one JSON object")
@@ -248,52 +247,45 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_calibration(group: Any) -> None:
-    """Arguments of :class:`Settings`, whose defaults hold where none is given."""
-    group.add_argument(
-        "--cut-off",
-        dest="cut_off_V",
-        type=float,
-        metavar="V",
-        help="voltage at which the discharge ends, V (default: 2.7, or that of the fit of --cell)",
-    )
-    group.add_argument(
-        "--prior",
-        dest="prior_q_mobile_C",
-        nargs=2,
-        type=float,
-        metavar=("MEAN", "SD"),
-        help="q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
-    )
-    group.add_argument(
-        "--initial-soc",
-        type=_initial_soc,
-        metavar="SOC",
-        help="state of charge when the load is switched on, after a rest: 0.8; with its standard deviation 0.8,0.02; or rest: "
-        "told from the voltage of a minute or more at rest before the load (default: 1, a full cell)",
-    )
-    group.add_argument(
-        "--mismatch",
-        dest="mismatch_V",
-        type=float,
-        metavar="V",
-        help="error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
-    )
-    group.add_argument(
-        "--cell",
-        type=Path,
-        metavar="FILE",
-        help="constants of the cell, as the command fit saves them, or CellParameters.to_json; or how cells of its kind age, "
-        "as fit_life finds it and AgingPath.to_json saves it (default: those of a new 18650)",
-    )
-    group.add_argument(
-        "--nominal",
-        dest="nominal_Ah",
-        type=float,
-        metavar="AH",
-        help="nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this "
-        "load); it also tells what to expect of a cell in progress that is below 1 or above 4 Ah",
-    )
+# Options of the settings, with names of their values: the setting that each fills, how a value is read, and what it means.
+_SETTINGS: Mapping[str, tuple[str, Callable[[str], Any], str]] = {
+    "--cut-off V": ("cut_off_V", float, "voltage at which the discharge ends, V (default: 2.7, or that of the fit of --cell)"),
+    "--prior MEAN SD": (
+        "prior_q_mobile_C",
+        float,
+        "q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
+    ),
+    "--initial-soc SOC": (
+        "initial_soc",
+        _initial_soc,
+        "state of charge when the load is switched on, after a rest: 0.8; with its standard deviation 0.8,0.02; or rest: told "
+        "from the voltage of a minute or more at rest before the load (default: 1, a full cell)",
+    ),
+    "--mismatch V": (
+        "mismatch_V",
+        float,
+        "error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
+    ),
+    "--cell FILE": (
+        "cell",
+        Path,
+        "constants of the cell, as the command fit saves them, or CellParameters.to_json; or how cells of its kind age, as "
+        "fit_life finds it and AgingPath.to_json saves it (default: those of a new 18650)",
+    ),
+    "--nominal AH": (
+        "nominal_Ah",
+        float,
+        "nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this load); it "
+        "also tells what to expect of a cell in progress that is below 1 or above 4 Ah",
+    ),
+}
+
+
+def _add_settings(group: Any) -> None:
+    for form, (setting, read, text) in _SETTINGS.items():
+        option, *values = form.split()
+        count = len(values) if len(values) > 1 else None
+        group.add_argument(option, dest=setting, type=read, nargs=count, metavar=tuple(values), help=text)
 
 
 def calibrate(arguments: Sequence[str] | None = None) -> int:
@@ -359,7 +351,9 @@ def _calibrate_all(
         absent = f", {results.absent} of them of files that are not there now" if results.absent else ""
         print(f"going on: {done} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True)
     try:
-        with workers(options.jobs, options.scheduler) as executor, saying_that_it_compiles():
+        is_serial = options.jobs == 1 and options.scheduler is None
+        side_by_side = nullcontext() if is_serial else workers(options.jobs, options.scheduler)
+        with side_by_side as executor, saying_that_it_compiles():
             ahead = 64 if options.scheduler or options.jobs < 1 else 2 * options.jobs
             for outcome in calibrate_all(sources, file_format, settings, results, executor, ahead):
                 _report(outcome, options.json)
@@ -415,14 +409,14 @@ def _file_format(options: argparse.Namespace) -> FileFormat:
 
 
 def _settings(options: argparse.Namespace) -> Settings:
-    names = {field.name for field in fields(Settings)} - {"cell"}
-    given: dict[str, Any] = {
+    """The settings that were stated; the default of a setting holds where its option is not given."""
+    stated: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in vars(options).items()
-        if name in names and value is not None
+        if name in SettingsOptions.__annotations__ and value is not None
     }
     with _saying(), _naming(options):
-        return Settings.for_file(options.cell, **given)
+        return Settings.for_file(stated.pop("cell", None), **stated)
 
 
 @contextmanager

@@ -13,8 +13,8 @@ from scipy.special import ndtr, ndtri
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_UNIT_SYMBOLS, LoadUnit, check_not_negative, check_positive, check_whole_number
 from battery_env.electrochemistry import NEW_CELL
-from battery_env.electrochemistry.ends import BAND, Cells, Ends, follow, quantile, run_down
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.ends import BAND, Cells, EndsOfDischarge, quantile, simulate_current, simulate_to_cut_off
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.estimates import Estimate
 from battery_env.estimates.findings import is_only_imprecise
 from battery_env.estimators.verdict import white_noise_V
@@ -225,18 +225,18 @@ def forecast(
         if 2 * len(alive) < samples:
             notes.append(f"The record contradicts {1.0 - len(alive) / samples:.0%} of what the estimate takes to be possible.")
         chosen = np.where(np.isin(np.arange(samples), alive), np.arange(samples), rng.choice(alive, size=samples))
-        cells, r_ohm = cells.part(chosen), r_ohm[chosen]
+        cells, r_ohm = cells.select(chosen), r_ohm[chosen]
     # the first draw is that of the new cell alone
     draws = _draws(ahead, samples + 1, rng) if isinstance(ahead, RandomLoad) else [ahead]
     if over:
         given_Ah = (1.0 - cells.soc) * cells.q_mobile / 3600.0
-        ends = Ends(np.zeros(samples), given_Ah, np.zeros(1), np.full((len(BAND), 1), cut_off))
+        ends = EndsOfDischarge(np.zeros(samples), given_Ah, np.zeros(1), np.full((len(BAND), 1), cut_off))
         above = np.flatnonzero(seen.voltage_V > reached_V)
         around = [above[-1] + 1, above[-1]] if len(above) else [0]
         now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
     else:
         now_s = float(seen.time_s[-1])
-        ends = run_down(cells, model, draws[-samples:], cut_off, every_s=10.0)
+        ends = simulate_to_cut_off(cells, model, draws[-samples:], cut_off, every_s=10.0)
     if nominal_Ah is None:
         # the mean over loads, sure to 1 %: under a single draw, health would be a matter of that draw. No charge takes a cell
         # to its end
@@ -294,7 +294,7 @@ def _to_come(
     """The load to come, and its name."""
     if load is None:
         expected = expected_current(record.time_s, record.current_A)
-        if expected.varied:
+        if expected.is_varying:
             return BlockBootstrap(record, steadier_unit(record), dt_s=model.dt_s), "a load as so far"
         load, unit = expected.mean_A, "current"
     if isinstance(load, RandomLoad):
@@ -359,7 +359,7 @@ def _draw_parameters(
     own_ohm = float(np.sqrt(sd_ohm**2 - slope_ohm**2))
     # what r_o has absorbed of the error of the model comes out under another current
     of_model_ohm = mismatch_V / float(np.sqrt(np.mean(current_A**2))) if current_A.any() else 0.0
-    whole_ohm = float(np.hypot(own_ohm, np.sqrt(WHOLE_ERROR**2 - 1.0) * of_model_ohm))
+    whole_ohm = float(np.hypot(own_ohm, np.sqrt(UNFITTED_ERROR_RATIO**2 - 1.0) * of_model_ohm))
     draws, middle_ohm = rng.standard_normal(samples), r_ohm + slope_ohm * deviation
     r_o, acting_ohm = (np.clip(middle_ohm + each_ohm * draws, *R_O.limits) for each_ohm in (own_ohm, whole_ohm))
     return q_C * np.exp(share * deviation), r_o, acting_ohm
@@ -388,7 +388,7 @@ def _at_the_end_of(
     measured_V = np.interp(record.time_s[0] + model.dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)
     last = slice(min(int((1.0 - RECENT_SHARE) * steps), steps - 1) + 1, None)
     at_first = Cells(*parameters, model.start(parameters[0]), np.zeros(count), np.zeros(count))
-    cells, run_V = follow(at_first, model, current_A[:-1], steps - last.start)
+    cells, run_V = simulate_current(at_first, model, current_A[:-1], steps - last.start)
     recent_V = np.mean(measured_V[last] - run_V, axis=1)
     # the voltage measured is noisy
     samples = max(int((record.time_s >= record.time_s[-1] - RECENT_SHARE * np.ptp(record.time_s)).sum()), 1)

@@ -20,15 +20,16 @@ from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
+from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
-from battery_env.estimators.least_squares import Alternative, LeastSquares
+from battery_env.estimators.least_squares import Alternative, LeastSquares, RecordFit
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
-from battery_env.records import VARIED_SHARE, DischargeStart, drawn, drawn_charge_C, mean_current_A
+from battery_env.records import VARIED_SHARE, DischargeStart, drawn_charge_C, integrate_load, mean_current_A
 from battery_env.records.discharge import Discharge
 
 #: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
@@ -65,7 +66,7 @@ class Life:
     :param usual_start: how the discharges start; ``None`` if they do not start and last alike
     :param cut_off_V: cut-off voltage of the discharges, V
     :param alternatives: the model of the last valid discharge, and others that its constants leave open
-        (:meth:`battery_env.LeastSquares.alternatives`)
+        (:class:`~battery_env.estimators.least_squares.Alternative`)
     """
 
     table: pd.DataFrame
@@ -92,7 +93,7 @@ class Life:
         """The prior of so many discharges later, at the load of the life or at another one, A; NaN: at any."""
         mean_C, sd_C = self.later_q_mobile_C(count)
         if other_A is not None:
-            return mean_C, hypot(sd_C, mean_C * WHOLE_ERROR * hypot(self.sd_share, self._open_share(other_A)))
+            return mean_C, hypot(sd_C, mean_C * UNFITTED_ERROR_RATIO * hypot(self.sd_share, self._open_share(other_A)))
         whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
         lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
         return lasted * mean_C, lasted * sd_C
@@ -256,10 +257,13 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
     held, unsure = copy(held), copy(unsure)
     held.usual_start = unsure.usual_start = usual_start or held.usual_start
     rows = []
+    last_valid: tuple[Estimate, RecordFit] | None = None
     for position, discharge in enumerate(discharges):
         row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
         try:
-            rows.append(row | _row_of(discharge, cut_off_V, held, unsure))
+            columns, of_its_own = _row_of(discharge, cut_off_V, held, unsure)
+            rows.append(row | columns)
+            last_valid = of_its_own if columns["valid"] else last_valid
         except ValueError as error:  # of one that cannot be used
             rows.append(
                 row
@@ -272,11 +276,10 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
             )
     texts = [{"reason": reason_of(row["findings"])} for row in rows]
     life = life_of(pd.DataFrame([row | text for row, text in zip(rows, texts, strict=True)], columns=_COLUMNS))
-    last = discharges[int(np.flatnonzero(life.table["valid"])[-1])]
-    record = last.loaded_part(cut_off_V)
-    estimate, alternatives = unsure.estimate(record), unsure.alternatives(record)
+    assert last_valid is not None  # a life without a valid discharge is refused
+    estimate, fit = last_valid
     sd_share = estimate.sd_q_mobile / estimate.q_mobile
-    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=alternatives)
+    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=fit.alternatives())
 
 
 def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> DischargeStart | None:
@@ -291,17 +294,23 @@ def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> Discharge
     return usual_start(alike) if len(steps) and np.median(steps) <= VARIED_SHARE else None
 
 
-def _row_of(discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: LeastSquares) -> dict[str, Any]:
-    """What one discharge says alone; of its resistance with constants that are not held, as they age, too."""
+def _row_of(
+    discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: LeastSquares
+) -> tuple[dict[str, Any], tuple[Estimate, RecordFit]]:
+    """
+    The row of one discharge in the table; and its estimate and fit with constants that are not held. The resistance in the row
+    is of this estimate, because constants age, too.
+    """
     record = discharge.loaded_part(cut_off_V)
-    estimate = held.estimate(record)
-    of_its_own = estimate if held.nuisance == unsure.nuisance else unsure.estimate(record)
+    fit = unsure.fit(record)
+    of_its_own = unsure.estimate_of(fit)
+    estimate = of_its_own if held.nuisance == unsure.nuisance else held.estimate(record)
     end_s = held.model.forecast(record, estimate, cut_off_V).eod_time_s
-    capacity_Ah = float(drawn(record.time_s, record.current_A, end_s)) / 3600.0
+    capacity_Ah = float(integrate_load(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
     # what leaves the resistance in doubt is no doubt of q_mobile
     of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]
-    return {
+    row = {
         "q_mobile_C": estimate.q_mobile,
         "sd_q_mobile_C": estimate.sd_q_mobile,
         "resistance_10s_ohm": of_its_own.resistance_10s_ohm,
@@ -316,6 +325,7 @@ def _row_of(discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: 
         "mean_current_A": mean_current_A(record),
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
     }
+    return row, (of_its_own, fit)
 
 
 def life_of(table: pd.DataFrame) -> Life:

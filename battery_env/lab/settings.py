@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from math import exp, hypot, log
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
@@ -13,12 +14,15 @@ import numpy as np
 from battery_env.checks import check_positive, hinting
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
-from battery_env.electrochemistry.cell import UNDELIVERED, new_cell_of
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.cell import Q_MOBILE_PER_CAPACITY, new_cell_of
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
+from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.search import SIZE_WIDTH
+from battery_env.estimators.verdict import PRIOR_LIMIT_SD
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import CUT_OFF_V, DischargeStart
@@ -75,7 +79,8 @@ class Settings:
     :param thermal: whether the temperature of the model changes; ``None``: as in the fit of ``cell``, or true
     :param nominal_Ah: nominal capacity for the state of health, Ah; ``None``: the charge that ``cell`` with its own
         ``q_mobile`` and ``r_o`` gives from full at the current of the discharge, or unknown without a ``cell``. Without other
-        prior knowledge the nominal capacity is also the expected size of a cell in progress, instead of a new 18650
+        prior knowledge the nominal capacity is also the expected size of a cell in progress, instead of a new 18650. No
+        estimate of another size than such cells have, new or worn, is settled
     :param cell: constants of the model, or a result of ``fit_cell``: more than a quarter beyond the loads of the fit no
         estimate is settled, and the nominal capacity is unknown. Or a result of ``fit_life``, the path of aging cells of this
         kind, for least squares. ``None``: the constants of a new 18650
@@ -192,7 +197,7 @@ class Settings:
         """Of a new cell of the nominal capacity, or of a new 18650 where none is stated."""
         if self.nominal_Ah is None:
             return NEW_CELL.q_mobile
-        return float(np.clip(UNDELIVERED * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
+        return float(np.clip(Q_MOBILE_PER_CAPACITY * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
 
     @property
     def usual_q_mobile_C(self) -> float | None:
@@ -200,12 +205,27 @@ class Settings:
         is_known = self.prior_q_mobile_C is not None or self.cell is not None
         return None if is_known else _USUAL_SHARE * self._new_q_mobile_C
 
-    def with_nominal_cell(self) -> Settings:
-        """With the constants of a cell of the nominal capacity, where that is of another size and nothing else is known."""
-        cell = new_cell_of(self._new_q_mobile_C)
-        if self.usual_q_mobile_C is None or self.method == "policy" or cell is NEW_CELL:
-            return self
-        return replace(self, cell=cell, cell_rates_sd=RATE_PRIOR_SD)
+    @property
+    def constants_in_progress(self) -> CellParameters:
+        """Of the model while a discharge is in progress: of a cell of the nominal capacity, where nothing else is known."""
+        if self.usual_q_mobile_C is None or self.method == "policy":
+            return self.constants
+        return new_cell_of(self._new_q_mobile_C)
+
+    def other_size(self, estimate: Estimate, drawn_C: float) -> tuple[Finding, ...]:
+        """
+        Why an estimate is not of a cell of the nominal capacity, new or worn; empty if it may be, or none is stated. The cell
+        holds no less than was drawn, and no more than ``q_mobile``, and of that what is nearest is compared.
+        """
+        if self.nominal_Ah is None:
+            return ()
+        usual_C = _USUAL_SHARE * self._new_q_mobile_C
+        nearest_C = float(np.clip(usual_C, Q_MOBILE_PER_CAPACITY * drawn_C, estimate.q_mobile))
+        ratio = exp(PRIOR_LIMIT_SD * hypot(SIZE_WIDTH, estimate.sd_q_mobile / estimate.q_mobile))
+        if not abs(log(nearest_C / usual_C)) > log(ratio):
+            return ()
+        sizes_C = {"record_Ah": nearest_C, "least_Ah": usual_C / ratio, "most_Ah": usual_C * ratio}
+        return (Finding.of(Reason.PRIOR_WRONG, "q_mobile", **{name: each_C / 3600.0 for name, each_C in sizes_C.items()}),)
 
     def other_load(self, current_A: float) -> tuple[Finding, ...]:
         """Why the constants may not hold for a mean current; empty if they do."""
@@ -249,7 +269,7 @@ class Settings:
         rates_sd = self._rates_sd()
         # constants that are anybody's, once they are free, explain as much of the error as q_mobile and r_o absorb
         is_explained = rates_sd is RATE_PRIOR_SD
-        mismatch_V = resolved.mismatch_V / WHOLE_ERROR if is_explained else resolved.mismatch_V
+        mismatch_V = resolved.mismatch_V / UNFITTED_ERROR_RATIO if is_explained else resolved.mismatch_V
         return LeastSquares(
             mismatch_V=mismatch_V, nuisance=rates_sd, path=self.path, usual_q_mobile_C=usual_q_mobile_C, **common
         )

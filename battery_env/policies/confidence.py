@@ -1,4 +1,4 @@
-"""How sure a policy may be of its estimates: as sure as the fit in its observation, and as near as it is to that fit."""
+"""The standard deviations and the verdict of a policy, from the fit in its observation and the distance from this fit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
-from battery_env.electrochemistry.aging_path import BESIDE_LIMIT_SD, EQUILIBRIUM_NAMES, AgingPath, cell_with
+from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, PATH_DISTANCE_LIMIT_SD, AgingPath, cell_with
 from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Reason
 from battery_env.estimators.diagnosis.evidence import evidence_of
@@ -26,83 +26,82 @@ from battery_env.estimators.verdict import (
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import ChargeHistory, Samples
 from battery_env.records.model import RecordModel
-from battery_env.tasks.voltage.fit import REACH_SD, Fitted
+from battery_env.tasks.voltage.fit import REACH_SD, FitResult
 from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES, VoltageTask
 
-# What is within its reach by less than this share may lie at its edge but for rounding.
+# Rounding, as a share of a limit of the fit.
 _ROUNDING = 1e-9
-# Residuals below this may be what a linear step leaves, V
+# Root mean square of residuals that a linear step may leave, V
 _LINEAR_STEP_V = 2e-3
 
 
 class Confidence:
     """
-    What a policy can state of one discharge after another.
+    Standard deviations and verdicts for the estimates of a policy.
 
-    :param task: that the policy acts in, with a fit in its observation
+    :param task: task of the policy, with a fit in its observation
     :param cell: constants of the model
     :param dt_s: time step of the model, s
     """
 
     def __init__(self, task: VoltageTask, cell: CellParameters, dt_s: float) -> None:
-        self._parameters = task.parameters
         self._offset_V = task.sensors.offset_V
         self._path: AgingPath | None = task.path
         self._sd_ratio = 1.0 if task.path is None else task.path.sd_ratio
         self._cell, self._dt_s = cell, dt_s
 
-    def _model_V(self, fitted: Fitted, n: int, record: Samples) -> FloatArray:
-        """The voltage of the model that was fitted, at the samples of a record."""
-        cell = cell_with(self._cell, _by_name(fitted, n))
-        # a linear step may go beyond
-        q_mobile, r_o = np.clip(fitted.estimate[n], *np.array([ESTIMATE_RANGES[name] for name in PARAMETER_NAMES]).T).tolist()
-        return RecordModel(cell, dt_s=self._dt_s).voltage(record, Estimate(q_mobile, r_o)) + fitted.offset_V[n]
+    def _model_V(self, fit: FitResult, n: int, record: Samples) -> FloatArray:
+        """Return the voltage of the fitted model at the samples of a record."""
+        cell = cell_with(self._cell, _by_name(fit, n))
+        # a linear step may leave the ranges
+        q_mobile, r_o = np.clip(fit.estimate[n], *np.array([ESTIMATE_RANGES[name] for name in PARAMETER_NAMES]).T).tolist()
+        return RecordModel(cell, dt_s=self._dt_s).voltage(record, Estimate(q_mobile, r_o)) + fit.offset_V[n]
 
-    def estimate(self, fitted: Fitted, n: int, estimate: FloatArray, record: Samples, history: ChargeHistory) -> Estimate:
+    def estimate(self, fit: FitResult, n: int, estimate: FloatArray, record: Samples, history: ChargeHistory) -> Estimate:
         """
-        An estimate, with its standard deviations, those of the fit with the distance of the estimate from it and the charge
-        that nobody saw; which of both numbers are settled, and why not both; and along a path what the fit says of the
-        constants. What is known of the parameters before settles nothing.
+        Return the estimate with its standard deviations and its verdict, and along a path with the constants of the fit. A
+        standard deviation combines the fit's, the distance of the estimate from the fit, and the uncertainty of the charge.
+        The verdict uses the fit's standard deviations under a flat prior of the parameters.
         """
         cell, (q_mobile, r_o), path = self._cell, estimate.tolist(), self._path
-        model_V = self._model_V(fitted, n, record)
+        model_V = self._model_V(fit, n, record)
         evidence = evidence_of(record, cell, 1.0, (q_mobile, r_o), history, model_V)
         diagnosis = Diagnosis(evidence, evidence.measured(1.0, float(record.time_s[0]), history.charge))
-        apart = np.abs(fitted.estimate[n] - estimate)
-        hidden = np.hypot([evidence.unseen_C, 0.0], apart)
-        sd = np.hypot(fitted.sd_alone[n] * [self._sd_ratio, 1.0], hidden)
+        distance = np.abs(fit.estimate[n] - estimate)
+        common_sd = np.hypot([evidence.sd_charge_C, 0.0], distance)
+        sd = np.hypot(fit.sd_flat_prior[n] * [self._sd_ratio, 1.0], common_sd)
         is_measured = np.isfinite(record.voltage_V)
         residual_V = (model_V - record.voltage_V)[is_measured]  # NaN after the model is empty
         white_V = white_noise_V(residual_V[np.isfinite(residual_V)])
         readings = len(residual_V)
         mismatch_V = 0.0 if path is None else path.mismatch_V
-        # the first voltage may be that of a full cell with the largest offset, and noise and model beyond
-        beyond_V = self._offset_V + MOST_NOISE_SD * hypot(white_V, MISMATCH_MARGIN * mismatch_V)
-        diagnosis.note(Reason.START_DIFFERS, float(record.voltage_V[0]) > rest_voltage_V(cell) + beyond_V)
-        diagnosis.note(Reason.FEW, readings < len(self._parameters) + SPARE_SAMPLES)
+        # limit of the first voltage: a full cell, the largest offset, and errors of noise and model
+        tolerance_V = self._offset_V + MOST_NOISE_SD * hypot(white_V, MISMATCH_MARGIN * mismatch_V)
+        diagnosis.note(Reason.START_DIFFERS, float(record.voltage_V[0]) > rest_voltage_V(cell) + tolerance_V)
+        diagnosis.note(Reason.FEW, readings < len(PARAMETER_NAMES) + SPARE_SAMPLES)
         limit_V2 = misfit_limit_V2(white_V, readings, mismatch_V, negligible_V=_LINEAR_STEP_V)
         diagnosis.note(Reason.MISFIT, not square(residual_V) <= readings * limit_V2)
-        most_sd = REACH_SD if path is None else BESIDE_LIMIT_SD
-        for what, size, most in (
-            ("distance from the constants that it has learned of", float(fitted.constants_sd[n]), most_sd),
-            ("offset of the voltage", abs(float(fitted.offset_V[n])), MISMATCH_MARGIN * self._offset_V),
+        limit_sd = REACH_SD if path is None else PATH_DISTANCE_LIMIT_SD
+        for quantity, size, limit in (
+            ("distance from the constants that it has learned of", float(fit.constants_sd[n]), limit_sd),
+            ("offset of the voltage", abs(float(fit.offset_V[n])), MISMATCH_MARGIN * self._offset_V),
         ):
-            if size > (1.0 - _ROUNDING) * most:  # as a fit keeps within its reach
-                diagnosis.note(Reason.OTHER_KIND, what=what, ratio=size / most)
+            if size > (1.0 - _ROUNDING) * limit:  # the fit clips at its limits
+                diagnosis.note(Reason.OTHER_KIND, what=quantity, ratio=size / limit)
         for k, name in enumerate(PARAMETER_NAMES):
-            if name in self._parameters:
-                diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
-        values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
-        known = Assumptions(apart=dict(zip(PARAMETER_NAMES, apart.tolist(), strict=True)), is_along_path=path is not None)
-        verdict = diagnosis.verdict(values, sds, self._parameters, known=known)
-        stated = dict(zip(PARAMETER_NAMES, np.hypot(self._sd_ratio * fitted.sd[n], hidden).tolist(), strict=True))
-        # the same NaN always, so that equal estimates are equal
-        sd_q_mobile, sd_r_o = (nan if name not in self._parameters or isnan(sd) else sd for name, sd in stated.items())
-        constants = None if path is None else _by_name(fitted, n)
+            diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
+        values, sds = (dict(zip(PARAMETER_NAMES, column.tolist(), strict=True)) for column in (estimate, sd))
+        distances = dict(zip(PARAMETER_NAMES, distance.tolist(), strict=True))
+        assumptions = Assumptions(apart=distances, is_along_path=path is not None)
+        verdict = diagnosis.verdict(values, sds, PARAMETER_NAMES, known=assumptions)
+        stated_sds = np.hypot(self._sd_ratio * fit.sd[n], common_sd).tolist()
+        # the same NaN object, so that equal estimates compare equal
+        sd_q_mobile, sd_r_o = (nan if isnan(sd) else sd for sd in stated_sds)
+        constants = None if path is None else _by_name(fit, n)
         return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **verdict._asdict(), constants=constants)
 
 
-def _by_name(fitted: Fitted, n: int) -> dict[str, float]:
-    """The constants of a fit, by their names; without a path it has none of the equilibrium voltage."""
+def _by_name(fit: FitResult, n: int) -> dict[str, float]:
+    """Return the constants of a fit by name, 0 for those that it does not have."""
     names = (*UNCERTAIN_CONSTANTS, *EQUILIBRIUM_NAMES)
-    return dict.fromkeys(names, 0.0) | dict(zip(names, fitted.constants[n].tolist(), strict=False))
+    return dict.fromkeys(names, 0.0) | dict(zip(names, fit.constants[n].tolist(), strict=False))

@@ -34,15 +34,15 @@ from battery_env.records import (
 from battery_env.records.model import RecordModel
 from battery_env.tasks.base import CalibrationTask
 from battery_env.tasks.env import CalibrationEnv, task_class
-from battery_env.tasks.voltage.fit import Fitted
+from battery_env.tasks.voltage.fit import FitResult
 from battery_env.tasks.voltage.voltage_task import VoltageTask
 
-# Steps in which a stream is followed, s
+# Time step of the model of a stream, s
 _STEP_S = 1.0
 
 
-def _unstated(values: FloatArray) -> Estimate:
-    """Of a policy without a fit, before its first decision, and of one that is not judged."""
+def _estimate_without_sd(values: FloatArray) -> Estimate:
+    """Return an estimate without standard deviations or verdict."""
     q_mobile, r_o = values.tolist()
     return Estimate(q_mobile, r_o, settled=False, findings=(Finding.of(Reason.NOTHING_STATED),))
 
@@ -56,18 +56,18 @@ class Predictor(Protocol):
 
 
 def _without_data(env_id: str, options: dict[str, Any]) -> dict[str, Any]:
-    """Options of an environment that simulates nothing, where it needs no simulation: only its task is asked for."""
+    """Return options with a placeholder for the data of a voltage-only task, so that making the task simulates nothing."""
     module, _, plain_id = env_id.rpartition(":")
-    if module:  # as gym.make has it
+    if module:  # as gym.make does
         import_module(module)
     task = gym.spec(plain_id).kwargs.get("task")
-    kind = None if task is None else task_class(task)
-    if kind is None or not issubclass(kind, VoltageTask):
+    task_type = None if task is None else task_class(task)
+    if task_type is None or not issubclass(task_type, VoltageTask):
         return options
-    reading_s = {**kind.options(), **options}["reading_s"]
+    reading_s = {**task_type.options(), **options}["reading_s"]
     time_s = np.array([0.0, 1.0, 2.0, 3.0]) * np.max(reading_s)
-    blank = Samples(time_s, np.full(4, NEW_CELL.VEOD), np.zeros(4))
-    return {**options, "cost": "misfit", "dataset": [blank]}
+    placeholder = Samples(time_s, np.full(4, NEW_CELL.VEOD), np.zeros(4))
+    return {**options, "cost": "misfit", "dataset": [placeholder]}
 
 
 class PolicyEstimator(OnlineEstimator):
@@ -81,8 +81,8 @@ class PolicyEstimator(OnlineEstimator):
       whole = load_nasa_discharges("B0005")[0].loaded_part(cut_off_V=2.7)
       print(PolicyEstimator.pretrained(recorded=True).estimate(whole))  # a policy that comes with the package
 
-    A model of your own is ``PolicyEstimator(model, "BatteryRo-v0")``, with the options of the environment that it was trained
-    on. Discharges that are estimated together run as one batch.
+    For your model use ``PolicyEstimator(model, "BatteryRo-v0")``, with the options of its training environment. Discharges
+    that are estimated together run as one batch.
 
     - A policy of a full-state environment estimates at every step, from the true state at the first sample on.
     - A policy of a voltage-only environment starts with the estimate of a new cell, and moves it every ``decision_s``. It
@@ -117,7 +117,7 @@ class PolicyEstimator(OnlineEstimator):
         self._no_constants = task.constants[0] if isinstance(task, VoltageTask) else np.zeros(0)
         self.dt_s = _STEP_S
         self._confidence: Confidence | None = None
-        if isinstance(task, VoltageTask) and task.fitted() is not None:
+        if isinstance(task, VoltageTask) and task.fit() is not None:
             self._confidence = Confidence(task, self.cell, self.dt_s)
         self.reset()
 
@@ -126,13 +126,13 @@ class PolicyEstimator(OnlineEstimator):
         cls, env_id: str = "BatteryVoltageJoint-v0", decision_s: float = 60.0, *, recorded: bool = False
     ) -> PolicyEstimator:
         """
-        A policy of LAC that comes with the package, with the options of the task that it was trained on. What made it and what
-        it is worth says :func:`~battery_env.policies.pretrained.pretrained_card`.
+        Load a policy of LAC that comes with the package, with the options of its training task. For its training and its
+        scores see :func:`~battery_env.policies.pretrained.pretrained_card`.
 
         :param env_id: id of a voltage-only environment
         :param decision_s: time between two estimates, s
-        :param recorded: whether for recorded cells: one that has learned along the lives of the bundled cells. By default one
-            that has learned on a model with wrong constants, as simulated cells have
+        :param recorded: whether for recorded cells, trained along the lives of the bundled cells; otherwise for simulated
+            cells, trained on a model with wrong constants
         :raises ValueError: for another id, or a time out of range
         :raises ImportError: without the extra ``battery_env[onnx]``
         """
@@ -141,30 +141,28 @@ class PolicyEstimator(OnlineEstimator):
 
     @staticmethod
     def environment(env_id: str, **options: Any) -> CalibrationEnv:
-        """A calibration environment, by its id and options, without its wrappers; a ``ValueError`` if it is none."""
+        """Make a calibration environment without its wrappers; a ``ValueError`` for the id of another environment."""
         env = gym.make(env_id, disable_env_checker=True, **options).unwrapped
         if not isinstance(env, CalibrationEnv):
             raise ValueError(f"{env_id} is no calibration environment")
         return env
 
     def reset(self) -> None:
-        """
-        Forget all samples: the next one is the first of a discharge, of a fully charged cell at rest.
-        """
+        """Forget all samples: the next sample is the first of a discharge, of a fully charged cell at rest."""
         self._samples: list[tuple[float, float, float]] = []
         self._drawn_C = 0.0
         self._decisions = 0
-        self._now = np.array([self.cell.q_mobile, self.cell.r_o])
+        self._values = np.array([self.cell.q_mobile, self.cell.r_o])
         self._constants = self._no_constants
-        self._fitted: Fitted | None = None
-        self._judge()
+        self._fit: FitResult | None = None
+        self._update_estimate()
 
-    def _judge(self) -> None:
-        """Tell how sure the estimate is, of the samples up to the last decision."""
-        self._estimate = _unstated(self._now)
-        if self._confidence is not None and self._fitted is not None:
+    def _update_estimate(self) -> None:
+        """Compute the estimate of the last decision, with its standard deviations and its verdict."""
+        self._estimate = _estimate_without_sd(self._values)
+        if self._confidence is not None and self._fit is not None:
             samples = with_voltage(self._samples, self._decisions * self.decision_s)
-            self._estimate = self._confidence.estimate(self._fitted, 0, self._now, samples, ChargeHistory())
+            self._estimate = self._confidence.estimate(self._fit, 0, self._values, samples, ChargeHistory())
 
     def check(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> None:
         """Refuse a sample that :meth:`update` would refuse, and change nothing."""
@@ -175,13 +173,13 @@ class PolicyEstimator(OnlineEstimator):
         if not self._samples:
             check_sample(voltage_V, current_A, dt_s)
             return
-        _, _, before_A = self._samples[-1]
-        check_sample(voltage_V, current_A, dt_s, previous_A=before_A)
-        check_drawn_charge(self._drawn_C + dt_s * before_A, -SURPLUS_SHARE * self.cell.q_mobile)
+        _, _, previous_A = self._samples[-1]
+        check_sample(voltage_V, current_A, dt_s, previous_A=previous_A)
+        check_drawn_charge(self._drawn_C + dt_s * previous_A, -SURPLUS_SHARE * self.cell.q_mobile)
 
     def update(self, voltage_V: float, current_A: float, dt_s: float, temperature_C: float | None = None) -> Estimate:
         """
-        Take in one sample. The policy decides when ``decision_s`` are over, as it would on the record so far.
+        Add one sample. The policy decides every ``decision_s``, as on the record so far.
 
         :param voltage_V: terminal voltage, V; NaN where it is missing, but for the first sample
         :param current_A: current that flows from this sample to the next one, positive in discharge, A
@@ -192,44 +190,44 @@ class PolicyEstimator(OnlineEstimator):
         """
         self.check(voltage_V, current_A, dt_s, temperature_C)
         time_s = self._samples[-1][0] + dt_s if self._samples else 0.0
-        self._take(time_s, float(voltage_V), float(current_A))
+        self._add_sample(time_s, float(voltage_V), float(current_A))
         return self._estimate
 
-    def _take(self, time_s: float, voltage_V: float, current_A: float) -> None:
+    def _add_sample(self, time_s: float, voltage_V: float, current_A: float) -> None:
         if self._samples:
-            before_s, _, before_A = self._samples[-1]
-            self._drawn_C += (time_s - before_s) * before_A
+            previous_s, _, previous_A = self._samples[-1]
+            self._drawn_C += (time_s - previous_s) * previous_A
         self._samples.append((time_s, voltage_V, current_A))
-        due = int(time_s / self.decision_s + 1e-9)
-        # two beside the first one
-        if due > self._decisions and len(with_voltage(self._samples, due * self.decision_s).time_s) > 2:
-            self._decide(due)
+        decisions = int(time_s / self.decision_s + 1e-9)
+        # a decision needs two voltages after the first one
+        if decisions > self._decisions and len(with_voltage(self._samples, decisions * self.decision_s).time_s) > 2:
+            self._decide(decisions)
 
-    def _follow(self, records: Sequence[Record], decision_s: float) -> CalibrationTask:
-        # a data set may know its own constants, of which the policy must not learn
+    def _task_of(self, records: Sequence[Record], decision_s: float) -> CalibrationTask:
+        # a data set may have the true constants, which the policy must not use
         cell = {"cell": self.cell} if issubclass(self.task_class, VoltageTask) else {}
-        return self.task_class.follow(records, decision_s, **{**self.options, **cell})
+        return self.task_class.of_records(records, decision_s, **{**self.options, **cell})
 
-    def _decide(self, due: int) -> None:
-        """One decision, on all readings up to the time when it was due."""
-        task = self._follow([on_grid(self._samples, self.dt_s)], due * self.decision_s)
-        assert isinstance(task, VoltageTask)  # no other follows a stream
-        task.restore(self._now, self._constants)
+    def _decide(self, decisions: int) -> None:
+        """Take one decision, on all readings up to the time of decision number ``decisions``."""
+        task = self._task_of([on_grid(self._samples, self.dt_s)], decisions * self.decision_s)
+        assert isinstance(task, VoltageTask)  # only this task takes a stream
+        task.restore(self._values, self._constants)
         self._constants = task.constants[0]
-        self._fitted = task.fitted()
+        self._fit = task.fit()
         action, _ = self.policy.predict(task.observation(), deterministic=True)
         task.advance(np.asarray(action))
-        self._decisions, self._now = due, task.estimate[0]
-        self._judge()
+        self._decisions, self._values = decisions, task.estimate[0]
+        self._update_estimate()
 
     def at_last_sample(self) -> tuple[RecordModel, Cells]:
-        """The model that follows the discharge, and its cell at the last sample, with the estimate as its parameters."""
+        """Return the model with the estimate as its parameters, and its cell at the last sample."""
         model = RecordModel(cell_with(self.cell, self._estimate.constants), dt_s=self.dt_s)
-        q_mobile, r_o = self._now.tolist()
+        q_mobile, r_o = self._values.tolist()
         state = model.start(q_mobile)
         if self._samples and self._samples[-1][0] > 0.0:
             state = model.simulate(on_grid(self._samples, self.dt_s).current_A, q_mobile, r_o).state[-1]
-        return model, Cells(self._now[:1], self._now[1:], state[None], np.zeros(1), np.zeros(1))
+        return model, Cells(self._values[:1], self._values[1:], state[None], np.zeros(1), np.zeros(1))
 
     def _made_with(self) -> dict[str, Any]:
         return {
@@ -247,14 +245,14 @@ class PolicyEstimator(OnlineEstimator):
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         self.reset()
         for sample in arrays["samples"].T.tolist():
-            self._take(*sample)
+            self._add_sample(*sample)
 
     def estimate(self, record: Record) -> Estimate:
         """
-        The estimate after one discharge: of a voltage-only policy the last one, of a full-state one, whose estimates are
-        independent of each other, the mean.
+        Estimate from one discharge: the last estimate of a voltage-only policy, and the mean of the independent estimates of a
+        full-state policy.
 
-        :param record: one discharge; with the full state a simulated one, as no recording has it
+        :param record: one discharge; for a full-state policy a simulated one
         :raises ValueError: for an invalid record
         """
         check_drawn_charge(drawn_charge_C(check_record(record)))
@@ -262,37 +260,37 @@ class PolicyEstimator(OnlineEstimator):
         if trace.sd_q_mobile is not None:
             return last_estimate(trace)
         first = 0 if self.task_class.is_averaged else -1
-        return _unstated(np.array([trace.q_mobile[first:].mean(), trace.r_o[first:].mean()]))
+        return _estimate_without_sd(np.array([trace.q_mobile[first:].mean(), trace.r_o[first:].mean()]))
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
-        """The estimates over time of many discharges, run as one batch, in their order."""
+        """Return the estimates over time of many discharges, run as one batch, in their order."""
         return self._traces(records)
 
     def _traces(self, records: Sequence[Record], judge_last_only: bool = False) -> list[EstimateTrace]:
-        """Those of :meth:`trace`; a verdict takes longer than a decision, and may be left to the last of each discharge."""
-        task = self._follow(records, self.decision_s)
+        """Return :meth:`trace`; verdicts, which are slow, may be limited to the last decision of each discharge."""
+        task = self._task_of(records, self.decision_s)
         samples = [] if self._confidence is None else [(Samples.of(record), history_of(record)) for record in records]
-        made: list[FloatArray] = []
-        judged: list[Estimate] = []
+        rows: list[FloatArray] = []
+        estimates: list[Estimate] = []
         while (running := ~task.truncated()).any():
-            (discharge, time_s, known), fitted = task.seen(), task.fitted()
+            (discharge, time_s, counts), fit = task.available_data(), task.fit()
             action, _ = self.policy.predict(task.observation(), deterministic=True)
             task.advance(np.asarray(action))
             estimate = task.estimate
-            if self._confidence is not None and fitted is not None:
-                is_left = judge_last_only & ~task.truncated()
+            if self._confidence is not None and fit is not None:
+                is_skipped = judge_last_only & ~task.truncated()
                 for n in np.flatnonzero(running).tolist():
                     record, history = samples[discharge[n]]
-                    seen = record.first(int(known[n]))
-                    sure = _unstated(estimate[n])
-                    if not is_left[n]:
-                        sure = self._confidence.estimate(fitted, n, estimate[n], seen, history)
-                    judged.append(sure)
-            made.append(np.column_stack([discharge, time_s, estimate])[running])
-            task.drop_ended()
-        rows = np.concatenate(made)
-        in_order = np.argsort(rows[:, 0], kind="stable")
-        of_each = np.split(in_order, np.searchsorted(rows[in_order, 0], np.arange(1, len(records))))
+                    available = record.first(int(counts[n]))
+                    decision = _estimate_without_sd(estimate[n])
+                    if not is_skipped[n]:
+                        decision = self._confidence.estimate(fit, n, estimate[n], available, history)
+                    estimates.append(decision)
+            rows.append(np.column_stack([discharge, time_s, estimate])[running])
+            task.drop_truncated()
+        table = np.concatenate(rows)
+        in_order = np.argsort(table[:, 0], kind="stable")
+        record_rows = np.split(in_order, np.searchsorted(table[in_order, 0], np.arange(1, len(records))))
         if self._confidence is None:
-            return [EstimateTrace(rows[n, 1], rows[n, 2], rows[n, 3]) for n in of_each]
-        return [EstimateTrace.of(rows[n, 1], [judged[k] for k in n]) for n in of_each]
+            return [EstimateTrace(table[n, 1], table[n, 2], table[n, 3]) for n in record_rows]
+        return [EstimateTrace.of(table[n, 1], [estimates[k] for k in n]) for n in record_rows]

@@ -19,39 +19,39 @@ _RECORDED = "_recorded"
 
 
 def pretrained_ids() -> tuple[str, ...]:
-    """Which environments a policy comes with the package for."""
+    """Return the ids of the environments that have a policy in the package."""
     names = (entry.name for entry in files(_PACKAGE).iterdir() if entry.name.endswith(".onnx"))
     return tuple(sorted({name.removesuffix(".onnx").removesuffix(_RECORDED) for name in names}))
 
 
 def file_stem(env_id: str, recorded: bool) -> str:
-    """What the files of a policy are called."""
+    """Return the name of the files of a policy, without their suffix."""
     return env_id + (_RECORDED if recorded else "")
 
 
 def pretrained_card(env_id: str, recorded: bool = False) -> dict[str, Any]:
     """
-    What made a policy, and what it is worth: ``command``, ``recipe`` (seed, hyperparameters, data), ``options`` (of the task,
-    which it needs when it is used), ``scores`` and ``versions``.
+    Return the card of a policy: ``command``, ``recipe`` (seed, hyperparameters, data), ``options`` (of the task, which every
+    use of the policy needs), ``scores`` and ``versions``.
 
     :param env_id: id of an environment
     :param recorded: as of :func:`pretrained_policy`
-    :return: the JSON file beside the policy
-    :raises ValueError: if none comes with the package
+    :return: the content of its JSON file
+    :raises ValueError: if the package has no such policy
     """
     with _file(env_id, recorded) as file:
         return _read_card(file)
 
 
 def pretrained_policy(env_id: str, recorded: bool = False) -> tuple[OnnxPolicy, dict[str, Any]]:
-    """A policy that comes with the package, run by onnxruntime: no torch, and no pickle."""
+    """Load a policy of the package, which onnxruntime runs, without torch or pickle, and the options of its task."""
     with _file(env_id, recorded) as file:
         return policy_of_file(file)
 
 
 def policy_of_file(file: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
     """
-    A policy from a file, with the options of its task from its card.
+    Load a policy from a file, and the options of its task from its card.
 
     :raises ValueError: if either is damaged, or they do not belong together
     """
@@ -62,7 +62,7 @@ def policy_of_file(file: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
 
 
 def write_card(file: Path, content: Mapping[str, Any]) -> None:
-    """Describe a policy in a JSON file of the same name beside it, with the checksums of both."""
+    """Write the card of a policy, a JSON file of the same name, with the checksums of both files."""
     card = {**content, "sha256": sha256(file.read_bytes()).hexdigest()}
     with replacing(file.with_suffix(".json")) as part:
         part.write_text(json.dumps({**card, "card_sha256": _digest(card)}, indent=2) + "\n", encoding="utf-8")
@@ -72,10 +72,10 @@ def _read_card(file: Path) -> dict[str, Any]:
     path = file.with_suffix(".json")
     try:
         card: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        is_whole = card.pop("card_sha256") == _digest(card)
+        is_intact = card.pop("card_sha256") == _digest(card)
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise ValueError(f"{path} is damaged, or no card of a policy: {error!r}") from error
-    if not is_whole:
+    if not is_intact:
         raise ValueError(f"{path} is damaged: its checksum is wrong")
     return card
 
@@ -86,7 +86,7 @@ def _digest(card: Mapping[str, Any]) -> str:
 
 @contextmanager
 def _file(env_id: str, recorded: bool) -> Iterator[Path]:
-    """A policy that comes with the package, in a folder with its card."""
+    """Return the file of a policy of the package, in one folder with its card."""
     if env_id not in pretrained_ids():
         raise ValueError(f"no policy for {env_id!r} comes with the package: there are {', '.join(pretrained_ids()) or 'none'}")
     with as_file(files(_PACKAGE)) as folder:

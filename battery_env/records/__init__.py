@@ -1,4 +1,4 @@
-"""Records of discharges: their samples, discharges of recorded cells, and the model under the current of a record."""
+"""Records of discharges: their samples, their load, and the model under their current."""
 
 from battery_env.records.history import ChargeBefore as ChargeBefore
 from battery_env.records.history import ChargeHistory as ChargeHistory
@@ -12,8 +12,8 @@ from battery_env.records.load import SWITCH_SHARE as SWITCH_SHARE
 from battery_env.records.load import VARIED_SHARE as VARIED_SHARE
 from battery_env.records.load import ExpectedCurrent as ExpectedCurrent
 from battery_env.records.load import LoadSpan as LoadSpan
-from battery_env.records.load import drawn as drawn
 from battery_env.records.load import expected_current as expected_current
+from battery_env.records.load import integrate_load as integrate_load
 from battery_env.records.load import is_load as is_load
 from battery_env.records.load import load_span as load_span
 from battery_env.records.load import resample_current as resample_current

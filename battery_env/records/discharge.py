@@ -20,7 +20,7 @@ from battery_env.records.load import (
     REST_CURRENT_A,
     SWITCH_SHARE,
     LoadSpan,
-    drawn,
+    integrate_load,
     load_on_sd_C,
     load_span,
     rest_current_A,
@@ -38,13 +38,13 @@ NASA_CITATION = (
 #: Cells whose discharges come with the package.
 BUNDLED_CELLS: tuple[str, ...] = ("B0005", "B0006")
 
-#: A discharge needs so many.
+#: Least number of samples of a discharge.
 LEAST_SAMPLES = 5
 _COLUMNS = ("time_s", "voltage_V", "current_A")
-# what cycles.csv tells about each discharge beyond the samples themselves
+# columns of cycles.csv that go into ``meta``
 _META_COLUMNS = ("test_id", "start_time", "ambient_temperature_C", "capacity_Ah", "Re_ohm", "Rct_ohm")
 _DURATION_LIMITS_S = (10.0, 1e6)
-#: What a clock may count in: what the command line calls it, and s.
+#: Units of a clock: the symbol on the command line, and the unit in s.
 CLOCKS = {
     "seconds": ("s", 1.0),
     "milliseconds": ("ms", 1e-3),
@@ -54,10 +54,10 @@ CLOCKS = {
     "hours": ("h", 3600.0),
     "days": ("d", 86400.0),
 }
-# No cell changes its voltage by this much from one sample to the next, and back, but for its load, V.
+# A voltage that changes by this from one sample to the next, and back, without its load is a fault of the sensor, V.
 _JUMP_V = 0.05
-# Where the load varies, more samples than these below the cut-off are no fault of the sensor.
-_FEW_SAMPLES = 3
+# Under a load that varies, a fault of the sensor spans at most this number of samples below the cut-off.
+_MOST_DIP_SAMPLES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +107,9 @@ class Discharge:
         least_s, most_s = _DURATION_LIMITS_S
         if not least_s <= duration_s <= most_s:
             units = [
-                Advice(
-                    f"Give the time in seconds: {tick_s * duration_s:.0f} s if it is in {unit}", "units", {"time": it}, "time"
-                )
-                for unit, (it, tick_s) in CLOCKS.items()
-                if least_s <= tick_s * duration_s <= most_s
+                Advice(f"Give the time in seconds: {ticks_s:.0f} s if it is in {unit}", "units", {"time": symbol}, "time")
+                for unit, (symbol, tick_s) in CLOCKS.items()
+                if least_s <= (ticks_s := tick_s * duration_s) <= most_s
             ]
             raise RecordError(
                 f"time_s must span {least_s:g} .. {most_s:g} s, got {duration_s:g} s, too "
@@ -126,9 +124,9 @@ class Discharge:
             )
 
     def _derived(self, **changes: Any) -> Discharge:
-        """The same with other columns, made of these: each column is checked once, when it comes from outside."""
+        """Return a copy with other columns, unchecked: each column was checked when it came from outside."""
         derived = object.__new__(Discharge)
-        for name, value in {**{each.name: getattr(self, each.name) for each in fields(self)}, **changes}.items():
+        for name, value in {**{column.name: getattr(self, column.name) for column in fields(self)}, **changes}.items():
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
             object.__setattr__(derived, name, value)
@@ -136,12 +134,12 @@ class Discharge:
         return derived
 
     def without_temperature(self) -> Discharge:
-        """The same as if the temperature had not been measured."""
+        """Return the discharge without its temperature."""
         return self._derived(temperature_C=None)
 
     @cached_property
     def load(self) -> LoadSpan:
-        """Where the load begins and ends."""
+        """The first and the last sample under load."""
         return load_span(self.time_s, self.current_A)
 
     @property
@@ -150,48 +148,44 @@ class Discharge:
         return drawn_charge_C(self)
 
     @property
-    def unseen_C(self) -> float:
-        """
-        Standard deviation of the charge drawn by all that no sample shows, C; what flows at rest may be an offset of the
-        sensor.
-        """
+    def sd_charge_C(self) -> float:
+        """Standard deviation of the charge drawn, C: from the moments of switches, the tester's counter, and an offset."""
         history, (first, last) = self.history, self.load
-        begin = max(first - 1, 0)  # a count is that of the load alone
-        unknown = [slice(begin, first + 1), slice(last, last + 2)] if history.is_counted else [slice(begin, None)]
-        switched_C = [switched_charge(self.time_s[rows], self.current_A[rows]).sd_C for rows in unknown]
-        return hypot(history.load_on_C, history.offset_A * float(np.ptp(self.time_s)), history.uncounted_C, *switched_C)
+        start = max(first - 1, 0)  # a counter covers the load only
+        uncounted = [slice(start, first + 1), slice(last, last + 2)] if history.is_counted else [slice(start, None)]
+        switched_C = [switched_charge(self.time_s[stretch], self.current_A[stretch]).sd_C for stretch in uncounted]
+        return hypot(history.load_on_C, history.offset_A * float(np.ptp(self.time_s)), history.sd_counter_C, *switched_C)
 
     @property
     def load_on_time_s(self) -> float:
         """
-        When the load was switched on, s: midway between the last sample at rest and the first one under load, as the switch
-        falls between the two, but at most one interval of the samples under load before these. A rest is often logged more
-        seldom than a load.
+        When the load was switched on, s: midway between the last sample at rest and the first sample under load, but at most
+        one interval of the samples under load before these, because testers often log a rest more seldom than a load.
         """
         if not (first := self.load.first):
             return float(self.time_s[0])
         return float(switch_times_s(self.time_s, self.current_A, np.array([first - 1]))[0])
 
     def _first_below(self, cut_off_V: float) -> int | None:
-        """The first sample under load that is at the cut-off or below."""
+        """Return the first sample under load that is at the cut-off or below."""
         if not isinstance(cut_off_V, Real) or np.isnan(cut_off_V):
             raise ValueError(f"cut_off_V must be a voltage in V, got {cut_off_V!r}")
         first, last = self.load
-        below = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V) + first
-        # a sample later the voltage may be that of this load still
-        for end in self._ends_of_loads(first, int(below[0]) - 2 if len(below) else last):
-            if self._ends_at(cut_off_V, end):
-                return end
-        if not len(below):
+        below_rows = np.flatnonzero(self.voltage_V[first : last + 1] <= cut_off_V) + first
+        # one sample after the switch the voltage may still be of the load before
+        for row in self._ends_of_loads(first, int(below_rows[0]) - 2 if len(below_rows) else last):
+            if self._ends_at(cut_off_V, row):
+                return row
+        if not len(below_rows):
             return None
-        begin = int(below[0])
-        back = np.flatnonzero(self.voltage_V[begin : last + 1] > cut_off_V) + begin
-        if begin > 0 and len(back):
-            self._refuse_dip(begin, int(back[0]), cut_off_V)
-        return begin
+        start = int(below_rows[0])
+        above_rows = np.flatnonzero(self.voltage_V[start : last + 1] > cut_off_V) + start
+        if start > 0 and len(above_rows):
+            self._refuse_dip(start, int(above_rows[0]), cut_off_V)
+        return start
 
     def _ends_of_loads(self, first: int, last: int) -> list[int]:
-        """The last samples of loads, from one sample to another, after which only smaller ones follow in the discharge."""
+        """Return the last samples, within ``first`` .. ``last``, of loads after which the discharge has only smaller loads."""
         current_A = np.append(self.current_A[first : self.load.last + 1], 0.0)
         largest_later_A = np.maximum.accumulate(current_A[:0:-1])[::-1]
         ends = np.flatnonzero(largest_later_A < (1.0 - SWITCH_SHARE) * current_A[:-1]) + first
@@ -199,48 +193,54 @@ class Discharge:
 
     def _ends_at(self, cut_off_V: float, last: int) -> bool:
         """
-        Whether the last sample of a load is as near to the cut-off as the one an interval before it is to that sample: a
-        tester stops by a reading that it need not write. The row of the end itself may lie just behind a regular one.
+        Whether the last sample of a load is no farther above the cut-off than the voltage falls over the interval before: a
+        tester need not write the reading that stops it, and may write the row of the end just after a regular row.
         """
         first, _ = self.load
         interval_s = float(np.median(np.diff(self.time_s[first : last + 1]))) if last > first else 0.0
-        before = max(int(np.searchsorted(self.time_s, self.time_s[last] - 0.5 * interval_s)) - 1, 0)
-        is_steady = abs(self.current_A[last] - self.current_A[before]) <= SWITCH_SHARE * self.current_A.max()
-        fall_V = self.voltage_V[before] - self.voltage_V[last]
+        previous = max(int(np.searchsorted(self.time_s, self.time_s[last] - 0.5 * interval_s)) - 1, 0)
+        is_steady = abs(self.current_A[last] - self.current_A[previous]) <= SWITCH_SHARE * self.current_A.max()
+        fall_V = self.voltage_V[previous] - self.voltage_V[last]
         return bool(is_steady and fall_V > 0.0 and self.voltage_V[last] - cut_off_V <= fall_V)
 
-    def _refuse_dip(self, begin: int, back: int, cut_off_V: float) -> None:
+    def _refuse_dip(self, dip_row: int, recovery_row: int, cut_off_V: float) -> None:
         """
-        Refuse a voltage that falls below the cut-off in one step and comes back in another, to no more than it was, where the
-        load explains neither: an ohmic drop takes no more than all of the voltage at the largest current.
+        Refuse a voltage that falls below the cut-off in one step and returns in another, to no more than before, if the load
+        explains neither step: an ohmic drop takes at most the whole voltage above the cut-off at the largest current.
         """
         voltage_V, current_A = self.voltage_V, self.current_A
-        most_A = current_A.max()
-        most_ohm = max(float(voltage_V.max()) - cut_off_V, 0.0) / most_A
-        if back - begin > _FEW_SAMPLES and np.ptp(current_A[begin - 1 : back + 1]) > SWITCH_SHARE * most_A:
+        largest_A = current_A.max()
+        largest_ohm = max(float(voltage_V.max()) - cut_off_V, 0.0) / largest_A
+        if (
+            recovery_row - dip_row > _MOST_DIP_SAMPLES
+            and np.ptp(current_A[dip_row - 1 : recovery_row + 1]) > SWITCH_SHARE * largest_A
+        ):
             return
 
-        def unexplained_V(higher: int, lower: int) -> float:
-            # one of them may be logged a sample later than the other
-            explained_V = most_ohm * max(float(current_A[max(lower - 1, 0) : lower + 1].max() - current_A[higher]), 0.0)
-            return float(voltage_V[higher] - voltage_V[lower]) - explained_V
+        def unexplained_V(high_row: int, low_row: int) -> float:
+            # the tester may log voltage and current one sample apart
+            explained_V = largest_ohm * max(
+                float(current_A[max(low_row - 1, 0) : low_row + 1].max() - current_A[high_row]), 0.0
+            )
+            return float(voltage_V[high_row] - voltage_V[low_row]) - explained_V
 
-        falls_V, returns_V = unexplained_V(begin - 1, begin), unexplained_V(back, back - 1)
-        if min(falls_V, returns_V) > _JUMP_V and unexplained_V(back, begin - 1) < _JUMP_V:
+        falls_V, returns_V = unexplained_V(dip_row - 1, dip_row), unexplained_V(recovery_row, recovery_row - 1)
+        if min(falls_V, returns_V) > _JUMP_V and unexplained_V(recovery_row, dip_row - 1) < _JUMP_V:
             raise ValueError(
-                f"the voltage falls to {voltage_V[begin]:.2f} V at {self.time_s[begin]:g} s and is back at "
-                f"{self.time_s[back]:g} s, and the load explains neither: a fault of the sensor, or another discharge. Remove "
-                f"these samples ({back - begin}), or give each discharge alone, or number them in a column of the cycle"
+                f"the voltage falls to {voltage_V[dip_row]:.2f} V at {self.time_s[dip_row]:g} s and is back at "
+                f"{self.time_s[recovery_row]:g} s, and the load explains neither: a fault of the sensor, or another discharge."
+                f" Remove these samples ({recovery_row - dip_row}), or give each discharge alone, or number them in a column "
+                "of the cycle"
             )
 
     def eod_time_s(self, cut_off_V: float) -> float:
         """
-        When the voltage under load first fell to the cut-off, interpolated between the two samples around it. A load that ends
-        above it by no more than the fall over the last interval of the samples ends there.
+        When the voltage under load first fell to the cut-off, interpolated between two samples. A load that stops above the
+        cut-off, by no more than the fall over its last interval, ends there.
 
         :param cut_off_V: cut-off voltage, V
         :return: the end of discharge on the clock of ``time_s``, s; NaN if the record does not reach it
-        :raises ValueError: if the voltage only seems to be there, by a fault of the sensor
+        :raises ValueError: if the voltage is at the cut-off by a fault of the sensor
         """
         n = self._first_below(cut_off_V)
         if n is None:
@@ -252,12 +252,12 @@ class Discharge:
 
     def loaded_part(self, cut_off_V: float) -> Discharge:
         """
-        The part that a model of the discharge can be compared with: from load-on to the cut-off, or to the last sample
-        under load if the cut-off is not reached. Its first sample is the moment of switching, with the voltage at rest
-        and the current under load; its last one, at the cut-off, is interpolated.
+        Return the part for the comparison with a model: from load-on to the cut-off, or to the last sample under load if the
+        cut-off is not reached. Its first sample is the moment of switching, with the voltage at rest and the current under
+        load; its last sample, at the cut-off, is interpolated.
 
         :param cut_off_V: cut-off voltage, V
-        :return: that part, on the same clock
+        :return: the part, on the same clock
         :raises ValueError: if it has too few samples, or the voltage is below the cut-off by a fault of the sensor
         """
         first, last = self.load
@@ -268,10 +268,10 @@ class Discharge:
         if len(time_s) < LEAST_SAMPLES:
             under_load_V = self.voltage_V[first : last + 1]
             if (above := int((under_load_V > cut_off_V).sum())) + LEAST_SAMPLES <= len(under_load_V):
-                rest = f", but for {above} samples," if above else ""
+                exception = f", but for {above} samples," if above else ""
                 least_V = float(f"{under_load_V[under_load_V > 0.0].min(initial=cut_off_V):.4g}")
                 raise RecordError(
-                    f"all of the voltage under load{rest} lies below the cut-off of {cut_off_V:g} V",
+                    f"all of the voltage under load{exception} lies below the cut-off of {cut_off_V:g} V",
                     [Advice("State where the discharge ends", "cut_off_V", least_V)],
                 )
             raise ValueError(
@@ -280,26 +280,26 @@ class Discharge:
             )
         names = ("voltage_V", "current_A") if self.temperature_C is None else ("voltage_V", "current_A", "temperature_C")
         columns = {name: np.interp(time_s, self.time_s, getattr(self, name)) for name in names}
-        # the last row before a load may already have the voltage under load: then the one before it is the last at rest
+        # the last row before a load may already have the voltage under load: then the row before it is the last at rest
         is_mixed = first > 1 and bool(
             abs(self.voltage_V[first - 1] - self.voltage_V[first]) < abs(self.voltage_V[first - 1] - self.voltage_V[first - 2])
         )
-        resting = max(first - 1 - is_mixed, 0)
-        columns["voltage_V"][0], columns["current_A"][0] = self.voltage_V[resting], self.current_A[first]
+        rest_row = max(first - 1 - is_mixed, 0)
+        columns["voltage_V"][0], columns["current_A"][0] = self.voltage_V[rest_row], self.current_A[first]
         starts_at_rest, history = self.starts_at_rest, self.history
         if first:
-            starts_at_rest = bool(abs(self.current_A[resting]) <= REST_CURRENT_A)
+            starts_at_rest = bool(abs(self.current_A[rest_row]) <= REST_CURRENT_A)
             load_on_C = load_on_sd_C(self.time_s, self.current_A, first, start_s)
-            history = history._replace(rest_s=float(self.time_s[resting] - self.time_s[0]), load_on_C=load_on_C)
+            history = history._replace(rest_s=float(self.time_s[rest_row] - self.time_s[0]), load_on_C=load_on_C)
         if (offset_A := rest_current_A(self.current_A)) is not None:
             history = history._replace(offset_A=offset_A)
         return self._derived(time_s=time_s, **columns, starts_at_rest=starts_at_rest, history=history)
 
     def averaged(self, dt_s: float) -> Discharge:
         """
-        The same with one sample for each stretch of time: the means of voltage and temperature over its samples, and the mean
-        current, so that the charge drawn is kept. The first and the last sample stay as they are. A load that is switched
-        within a stretch is switched in two steps.
+        Return the discharge with one sample for each stretch of time: the means of voltage and temperature over its samples,
+        and the mean current, which keeps the charge drawn. The first and the last sample stay as they are. A load that is
+        switched within a stretch is switched in two steps.
 
         :param dt_s: length of a stretch, s
         :return: at most ``2 + (last time - first time) / dt_s`` samples, rounded up
@@ -315,17 +315,15 @@ class Discharge:
             return np.concatenate([values[:1], np.add.reduceat(values[inner], firsts) / counts, values[-1:]])
 
         time_s = mean(self.time_s)
-        # from the middle between two means to the next middle, so that nothing is drawn twice or left out
+        # edges midway between means, so that the stretches cover the charge exactly once
         edges_s = np.concatenate([time_s[:1], 0.5 * (time_s[1:] + time_s[:-1]), time_s[-1:]])
-        current_A = np.diff(drawn(self.time_s, self.current_A, edges_s)) / np.diff(edges_s)
+        current_A = np.diff(integrate_load(self.time_s, self.current_A, edges_s)) / np.diff(edges_s)
         current_A[[0, -1]] = self.current_A[[0, -1]]
         temperature_C = None if self.temperature_C is None else mean(self.temperature_C)
         return self._derived(time_s=time_s, voltage_V=mean(self.voltage_V), current_A=current_A, temperature_C=temperature_C)
 
     def until(self, time_s: float) -> Discharge:
-        """
-        The samples that had been recorded by some moment on the clock of the record, s; a ``ValueError`` if these are too few.
-        """
+        """Return the samples up to a time on the clock of the record, s; a ``ValueError`` if these are too few."""
         if not isinstance(time_s, Real) or np.isnan(time_s):
             raise ValueError(f"time_s must be a time in s, got {time_s!r}")
         n = int(np.searchsorted(self.time_s, time_s, side="right"))
@@ -335,7 +333,7 @@ class Discharge:
 
 def load_nasa_discharges(cell: str) -> list[Discharge]:
     """
-    All discharges of one cell of NASA's battery data set, in the order they were made. Cite it as ``NASA_CITATION``.
+    Load all discharges of one cell of NASA's battery data set, in their order. Cite it as ``NASA_CITATION``.
 
     .. code-block:: python
 
@@ -358,7 +356,7 @@ def load_nasa_discharges(cell: str) -> list[Discharge]:
         raise FileNotFoundError(
             f"no cell {str(cell)!r} comes with the package, but {', '.join(BUNDLED_CELLS)}; read_discharges reads files"
         )
-    return [each._derived(meta=dict(each.meta)) for each in _bundled(cell)]
+    return [discharge._derived(meta=dict(discharge.meta)) for discharge in _bundled(cell)]
 
 
 @lru_cache
@@ -366,11 +364,11 @@ def _bundled(cell: str) -> list[Discharge]:
     with as_file(files("battery_env.records.nasa_cells")) as folder:
         samples = pd.read_csv(folder / f"{cell}_discharge.csv.gz", usecols=["cycle", *_COLUMNS, "temperature_C"])
         tests = pd.read_csv(folder / "cycles.csv").query("battery_id == @cell").set_index("cycle")[list(_META_COLUMNS)]
-    known, numbers = tests.to_dict(orient="index"), samples["cycle"].to_numpy()
+    test_meta, cycles = tests.to_dict(orient="index"), samples["cycle"].to_numpy()
     discharges = []
-    for cycle in np.unique(numbers).tolist():
-        part = samples[numbers == cycle]
-        time_s, voltage_V, current_A, temperature_C = (part[name].to_numpy() for name in (*_COLUMNS, "temperature_C"))
-        meta = {"cell": cell, "cycle": cycle, "source": NASA_CITATION, **known[cycle]}
+    for cycle in np.unique(cycles).tolist():
+        rows = samples[cycles == cycle]
+        time_s, voltage_V, current_A, temperature_C = (rows[name].to_numpy() for name in (*_COLUMNS, "temperature_C"))
+        meta = {"cell": cell, "cycle": cycle, "source": NASA_CITATION, **test_meta[cycle]}
         discharges.append(Discharge(time_s, voltage_V, current_A, temperature_C, meta))
     return discharges

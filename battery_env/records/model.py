@@ -1,4 +1,4 @@
-"""The model under the current of a record: what it shows then and afterwards, and how that depends on both parameters."""
+"""The model under the current of a record: its voltage during and after the record, and its derivatives."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from battery_env.electrochemistry import (
     simulate,
 )
 from battery_env.electrochemistry.aging_path import cell_with
-from battery_env.electrochemistry.ends import LONGEST_S, Cells, ToCome, run_down
+from battery_env.electrochemistry.ends import LONGEST_S, Cells, FutureLoad, simulate_to_cut_off
 from battery_env.electrochemistry.tangents import TANGENT_NAMES, PolynomialDerivatives, least_q_mobile, roll_out_with_tangents
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE, R_O
@@ -36,7 +36,7 @@ from battery_env.records.samples import Record, check_record
 # The total of the four charges is q_mobile / 0.6 at all times.
 _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
 
-#: The error of the model shortly before the end of a record is the mean over this last share of its time.
+#: The error of the model at the end of a record is the mean over this last share of its time.
 RECENT_SHARE = 0.1
 
 
@@ -61,21 +61,20 @@ class VoltageForecast:
     @property
     def eod_time_s(self) -> float:
         """
-        When the cut-off is reached, on the clock of the record, s; NaN if it is not, or under a current so small that it would
-        take more than a week.
+        When the cut-off is reached, on the clock of the record, s; NaN if it is not reached, or only after more than a week.
         """
         return self.reached_s(self.cut_off_V)
 
     @property
     def time_s(self) -> FloatArray:
-        """Of the steps of the model down to the cut-off, on the clock of the record, s, shape (K,)."""
+        """Times of the model's steps down to the cut-off, on the clock of the record, s, shape (K,)."""
         return self._down_to_the_cut_off[0]
 
     @property
     def voltage_V(self) -> FloatArray:
         """
-        At these times, V, shape (K,). The last one is the cut-off, between two steps; it is above if the cut-off is never
-        reached, as the load is off at the end of the record.
+        Voltage at ``time_s``, V, shape (K,). The last voltage is the cut-off, between two steps; it is above the cut-off if
+        the cut-off is never reached, because the load is off at the end of the record.
         """
         return self._down_to_the_cut_off[1]
 
@@ -84,8 +83,8 @@ class VoltageForecast:
         time_s, voltage_V, end_s = self.simulation.time_s, self.simulation.voltage_V, self.eod_time_s
         if np.isnan(end_s):
             return time_s, voltage_V
-        before = time_s < end_s
-        return np.append(time_s[before], end_s), np.append(voltage_V[before], self.cut_off_V)
+        is_above = time_s < end_s
+        return np.append(time_s[is_above], end_s), np.append(voltage_V[is_above], self.cut_off_V)
 
 
 class Tangents(NamedTuple):
@@ -149,19 +148,19 @@ class RecordModel:
         self._derivatives = PolynomialDerivatives.of(self.cell.packed)
 
     def of_cell(self, cell: CellParameters) -> RecordModel:
-        """The same model, with the same start, of other constants at the same temperature."""
+        """Return the model with the same start and temperature, and other constants."""
         model = copy(self)
         model.cell, model._derivatives = check_cell(cell, self.thermal), PolynomialDerivatives.of(cell.packed)
         check_dt(self.dt_s, cell)
         return model
 
     def at(self, estimate: Estimate) -> RecordModel:
-        """The same model with the constants that were found beside an estimate, if there are any."""
+        """Return the model with the fitted constants of an estimate, if it has any."""
         return self if estimate.constants is None else self.of_cell(cell_with(self.cell, estimate.constants))
 
     def grid(self, record: Record) -> tuple[FloatArray, FloatArray]:
         """
-        A record on the time grid of the model, which starts at the first sample.
+        Return a record on the time grid of the model, which starts at the first sample.
 
         :param record: one discharge
         :return: times of the samples since the first one, s, shape (T,); current over each step, A, shape (K,), such that
@@ -174,8 +173,8 @@ class RecordModel:
 
     def start(self, q_mobile: float | FloatArray) -> FloatArray:
         """
-        The state at the first sample, shape (..., 8), of cells with some ``q_mobile``, C, shape (...), and the history that
-        ``initial`` stands for, or at rest with ``initial_soc``.
+        Return the state at the first sample, shape (..., 8), of cells with ``q_mobile``, C, shape (...): ``initial``, with its
+        charges in proportion, or at rest with ``initial_soc``.
         """
         missing_C = np.asarray(q_mobile - _Q_PER_CHARGE * self.initial[QNB:].sum())
         start = np.broadcast_to(self.initial, (*missing_C.shape, STATE_SIZE)).copy()
@@ -184,7 +183,7 @@ class RecordModel:
 
     def simulate(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Trajectory:
         """
-        What the model does under a current, with no cut-off.
+        Simulate the model under a current, without a cut-off.
 
         :param current_A: current over each step, A, shape (K,)
         :param q_mobile: charge that can move, C
@@ -206,15 +205,15 @@ class RecordModel:
 
     def voltage(self, record: Record, at: Estimate) -> FloatArray:
         """
-        The voltage of the model at the samples of a record, under its current.
+        Return the voltage of the model at the samples of a record, under its current.
 
         :param record: one discharge
-        :param at: the parameters, with constants that were found beside them
+        :param at: the parameters, with their fitted constants
         :return: voltage in V, shape (T,); NaN after the model cell is empty
         :raises ValueError: for parameters out of range, or a record that cannot be used
         """
         time_s, current_A = self.grid(record)
-        return _at(time_s, self.at(at).simulate(current_A, at.q_mobile, at.r_o))
+        return _at_times(time_s, self.at(at).simulate(current_A, at.q_mobile, at.r_o))
 
     def forecast(
         self,
@@ -224,9 +223,9 @@ class RecordModel:
         future_current_A: float | None = None,
     ) -> VoltageForecast:
         """
-        The voltage of the model alone from the first sample of a record down to the cut-off, under the current of the record,
-        and beyond its end under a constant one. When a cell in progress will end, :func:`battery_env.forecast` says: its
-        voltage was higher or lower than the model's.
+        Return the voltage of the model from the first sample of a record down to the cut-off, under the current of the record,
+        and beyond its end under a constant current. For the end of a cell in progress use :func:`battery_env.forecast`, which
+        corrects the error of the model.
 
         :param record: one discharge, whole or in progress
         :param at: the parameters
@@ -243,45 +242,45 @@ class RecordModel:
         else:
             check_not_negative(future_current_A=future_current_A)
         if future_current_A * LONGEST_S > at.q_mobile:
-            # no cell of this q_mobile lasts longer than this, whatever it had delivered before
+            # no cell of this q_mobile lasts longer, even from full
             steps = int(at.q_mobile / (future_current_A * self.dt_s)) + 1
             current_A = np.append(current_A[:-1], np.full(steps + 1, future_current_A))
         simulation, start_s = self.at(at).simulate(current_A, at.q_mobile, at.r_o), float(record.time_s[0])
         return VoltageForecast(
             replace(simulation, time_s=start_s + simulation.time_s, eod_time_s=start_s + simulation.eod_time_s),
             self.cell.VEOD if cut_off_V is None else cut_off_V,
-            _at(samples_s, simulation),
+            _at_times(samples_s, simulation),
         )
 
     def capacity_Ah(
-        self, loads: Sequence[ToCome], cut_off_V: float, q_mobile: ArrayLike | None = None, r_o: ArrayLike | None = None
+        self, loads: Sequence[FutureLoad], cut_off_V: float, q_mobile: ArrayLike | None = None, r_o: ArrayLike | None = None
     ) -> FloatArray:
         """
-        The charge that cells give from full down to the cut-off; what a load charges first comes on top.
+        Return the charge that cells deliver from full down to the cut-off, plus any charge that the load returns first.
 
         :param loads: of :mod:`battery_env.loads`, in one unit, one for all or one a cell
         :param cut_off_V: cut-off voltage, V
         :param q_mobile: charge that can move, C, shape (n,); ``None``: that of ``cell``
-        :param r_o: ohmic resistance, ohm, shape (n,); likewise
+        :param r_o: ohmic resistance, ohm, shape (n,); ``None``: that of ``cell``
         :return: Ah, shape (n,); NaN if the cut-off is not reached within a week
         """
         q_C = Q_MOBILE.check(self.cell.q_mobile if q_mobile is None else q_mobile)
         r_ohm = R_O.check(self.cell.r_o if r_o is None else r_o)
-        q_C, r_ohm, _ = (np.array(each) for each in np.broadcast_arrays(q_C, r_ohm, np.empty(len(loads))))
-        as_model = np.zeros(len(q_C))
-        full = Cells(q_C, r_ohm, initial_state(q_C, self.cell), as_model, as_model)
-        return run_down(full, self, loads, cut_off_V, surplus_share=np.inf).capacity_Ah
+        q_C, r_ohm, _ = (np.array(column) for column in np.broadcast_arrays(q_C, r_ohm, np.empty(len(loads))))
+        no_error_V = np.zeros(len(q_C))
+        full_cells = Cells(q_C, r_ohm, initial_state(q_C, self.cell), no_error_V, no_error_V)
+        return simulate_to_cut_off(full_cells, self, loads, cut_off_V, surplus_share=np.inf).capacity_Ah
 
     def sensitivities(
         self, current_A: FloatArray, q_mobile: float, r_o: float, stride: int = 1
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
-        The voltage under a current and its derivatives with respect to both parameters; unchecked.
+        Return the voltage under a current and its derivatives with respect to both parameters; unchecked.
 
         :param current_A: current over each step, A, shape (K,)
         :param q_mobile: charge that can move, C
         :param r_o: ohmic resistance, ohm
-        :param stride: steps of ``dt_s`` that ``current_A`` holds for: 1, or more for a coarse look
+        :param stride: number of ``dt_s`` in a step: 1, or more for a coarse simulation
         :return: voltage, V, dV/dq_mobile, V/C, and dV/dr_o, A, each of shape (K,); NaN after the model cell is empty
         """
         columns = np.full((3, len(current_A)), np.nan)
@@ -290,8 +289,7 @@ class RecordModel:
 
     def tangents(self, current_A: FloatArray, q_mobile: float, r_o: float) -> Tangents:
         """
-        As :meth:`sensitivities`, with the derivatives by the logarithms of the constants that say how fast the cell follows
-        its load; unchecked.
+        Return :meth:`sensitivities` with the derivatives by the logarithms of ``RATE_CONSTANTS``; unchecked.
         """
         columns = np.full((len(TANGENT_NAMES) + 2, len(current_A)), np.nan)
         self._roll_out(current_A, q_mobile, r_o, 1, columns)
@@ -313,18 +311,18 @@ class RecordModel:
 
     def least_q_mobile_C(self, current_A: FloatArray) -> float:
         """
-        The ``q_mobile`` below which the model cell is empty before a current over each step, A, ends, C. At a fixed current
-        its charges are linear in ``q_mobile``, so that one roll-out gives it exactly.
+        Return the ``q_mobile`` below which the model cell is empty before a current over each step, A, ends, C. At a fixed
+        current the charges are linear in ``q_mobile``, so that one roll-out gives it exactly.
         """
         return self.least_q_mobile_tangent_C(current_A)[0]
 
     def least_q_mobile_tangent_C(self, current_A: FloatArray) -> tuple[float, float]:
-        """The same and its derivative by the logarithm of ``tDiffusion``, the only other constant it depends on, both in C."""
+        """Return :meth:`least_q_mobile_C`, and its derivative by the logarithm of ``tDiffusion``, the only other cause, C."""
         q_C = Q_MOBILE.limits[1]
         constants = self.cell.packed.constants
         least_C, by_t_C = least_q_mobile(current_A, q_C, self.dt_s, constants, self.start(q_C), self._shares)
         return float(least_C), float(by_t_C)
 
 
-def _at(time_s: FloatArray, simulation: Trajectory) -> FloatArray:
+def _at_times(time_s: FloatArray, simulation: Trajectory) -> FloatArray:
     return np.interp(time_s, simulation.time_s, simulation.voltage_V, right=np.nan)

@@ -1,4 +1,4 @@
-"""A record: time, voltage and current as they were measured during one discharge. What is valid, and how it comes in live."""
+"""A record: time, voltage and current as measured during one discharge; its checks, and its samples as a live stream."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from numpy.typing import ArrayLike
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_LIMITS, check_real
-from battery_env.records.load import REST_CURRENT_A, drawn
+from battery_env.records.load import REST_CURRENT_A, integrate_load
 from battery_env.records.refusals import Advice, RecordError
 
-#: Least and greatest time between two samples of a stream, s. Seconds given in milliseconds or in hours are mostly beyond.
+#: Least and greatest time between two samples of a stream, s. They catch most times in milliseconds or in hours.
 SAMPLE_INTERVAL_LIMITS_S = (1e-3, 600.0)
-#: At rest the next sample may come after as long as a week, s.
+#: Greatest time to the next sample at rest, s.
 REST_LIMIT_S = 604_800.0
-#: Where discharges of recorded cells end if nothing else is said, V.
+#: Default cut-off of recorded cells, V.
 CUT_OFF_V = 2.7
 
-#: What a current that is out of range usually is.
+#: Advice on a current that is out of range.
 MILLIAMPERE = Advice("Give the current in A, not in mA", "units", {"current": "mA"}, "current")
-# What to do about a value that is missing in a stream
-_MISSING = {
+# Advice on a value that is missing in a stream
+_MISSING_ADVICE = {
     "voltage_V": "A voltage may be missing (NaN), but for the first one, which tells whether the cell is full.",
     "current_A": "The charge that was drawn cannot do without it: give the mean current since it was last known.",
     "temperature_C": "Leave it out (None) where it is missing.",
 }
-#: What the sign of a current may be, where it was taken for the other one.
+#: Advice on a current of the wrong sign.
 SIGNS = (
     Advice("State that the file counts a discharge as negative", "discharge_is_negative", True, "is negative"),
     Advice("State that the file counts a discharge as positive", "discharge_is_negative", False, "is positive"),
 )
-#: By name: least and largest plausible value, and unit.
+#: Least and largest plausible value, and unit, by name.
 PLAUSIBLE: dict[str, tuple[float, float, str]] = {
     "voltage_V": (-0.1, 5.5, "V"),  # half cells are driven a little below 0
     "current_A": (-LOAD_LIMITS["current"], LOAD_LIMITS["current"], "A"),
     "temperature_C": (-60.0, 150.0, "degC"),
 }
-# What a value beyond usually is.
-_BEYOND = {
+# Advice on a value beyond these limits.
+_ADVICE_BEYOND = {
     "voltage_V": (
         Advice("Give the voltage of one cell, not that of a pack"),
         Advice("Give the voltage in V, not in mV", "units", {"voltage": "mV"}, "voltage"),
@@ -69,7 +69,7 @@ class Record(Protocol):
 
 
 class Samples(NamedTuple):
-    """Samples of a record, which are a record themselves: s, V, and A, positive in discharge; arrays of shape (T,)."""
+    """Samples of a record, a :class:`Record` too: s, V, and A, positive in discharge; arrays of shape (T,)."""
 
     time_s: FloatArray
     voltage_V: FloatArray
@@ -77,11 +77,11 @@ class Samples(NamedTuple):
 
     @classmethod
     def of(cls, record: Record) -> Samples:
-        """Those of any record."""
+        """Return the samples of any record."""
         return cls(*(np.asarray(column) for column in (record.time_s, record.voltage_V, record.current_A)))
 
     def first(self, count: int) -> Samples:
-        """The first ones."""
+        """Return the first samples."""
         return Samples(*(column[:count] for column in self))
 
 
@@ -100,27 +100,29 @@ def check_column(name: str, values: ArrayLike, least_samples: int) -> FloatArray
         raise ValueError(
             f"{name} must hold one value a sample, at least {least_samples} samples in all; got shape {array.shape}"
         )
-    bad = np.flatnonzero(~np.isfinite(array))
-    if len(bad):
-        raise ValueError(f"{name} must be finite, got {array[bad[0]]} at sample {bad[0]}. Remove or fill such samples.")
+    invalid = np.flatnonzero(~np.isfinite(array))
+    if len(invalid):
+        raise ValueError(
+            f"{name} must be finite, got {array[invalid[0]]} at sample {invalid[0]}. Remove or fill such samples."
+        )
     if name in PLAUSIBLE:
         low, high, _ = PLAUSIBLE[name]
-        bad = np.flatnonzero((array < low) | (array > high))
-        if len(bad):
-            raise _implausible(name, float(array[bad[0]]), f" at sample {bad[0]}")
+        invalid = np.flatnonzero((array < low) | (array > high))
+        if len(invalid):
+            raise _implausible(name, float(array[invalid[0]]), f" at sample {invalid[0]}")
     array.setflags(write=False)
     return array
 
 
 def _implausible(name: str, value: float, where: str = "") -> RecordError:
     low, high, unit = PLAUSIBLE[name]
-    # what is too low is of no other unit, as a negative voltage of a half cell
-    advice = _BEYOND[name] if value > high or low == -high else ()
+    # a value that is too low has no other unit: it may be a negative voltage of a half cell
+    advice = _ADVICE_BEYOND[name] if value > high or low == -high else ()
     return RecordError(f"{name} must lie within {low:g} .. {high:g} {unit}, got {value:g}{where}", advice)
 
 
 def check_record(record: Record, least_samples: int = 1) -> Samples:
-    """Refuse an invalid record; one that was checked when it was made, a discharge, is not checked again."""
+    """Refuse an invalid record; a discharge, which was checked on construction, is not checked again."""
     if getattr(record, "is_checked", False) and len(record.time_s) >= least_samples:
         return Samples.of(record)
     return check_samples(record.time_s, record.voltage_V, record.current_A, least_samples)
@@ -132,7 +134,7 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
         name: check_column(name, values, least_samples)
         for name, values in (("time_s", time_s), ("voltage_V", voltage_V), ("current_A", current_A))
     }
-    # so little is lost in the largest current that a record may hold
+    # smaller currents vanish in the rounding of the largest current that a record may hold
     largest_A, least_A = float(np.abs(arrays["current_A"]).max(initial=0.0)), LOAD_LIMITS["current"] * np.finfo(np.float64).eps
     if 0.0 < largest_A < least_A:
         raise ValueError(f"current_A must reach {least_A:.1g} A, got {largest_A:g} A at most: no sensor reads so little")
@@ -140,9 +142,9 @@ def check_samples(time_s: ArrayLike, voltage_V: ArrayLike, current_A: ArrayLike,
     for name, array in arrays.items():
         if len(array) != len(time):
             raise ValueError(f"{name} has {len(array)} samples, but time_s has {len(time)}")
-    stalls = np.flatnonzero(np.diff(time) <= 0.0)
-    if len(stalls):
-        n = stalls[0] + 1
+    stalled_rows = np.flatnonzero(np.diff(time) <= 0.0)
+    if len(stalled_rows):
+        n = stalled_rows[0] + 1
         if time[n] == time[n - 1]:
             advice = "Give each sample once, with a clock that tells it from the next, or name the column of its step"
         else:
@@ -177,7 +179,7 @@ def check_sample(
             continue
         if isfinite(value):
             raise _implausible(name, value)
-        raise ValueError(f"{name} must be finite, got {value!r}. {_MISSING[name]}")
+        raise ValueError(f"{name} must be finite, got {value!r}. {_MISSING_ADVICE[name]}")
     if previous_A is None:
         return
     low, high = SAMPLE_INTERVAL_LIMITS_S
@@ -196,7 +198,7 @@ def _is_within(name: str, value: float, low: float, high: float) -> bool:
             raise TypeError("a truth value")
         return low <= value <= high
     except TypeError as error:
-        raise TypeError(f"{name} must be a number, got {value!r}. {_MISSING.get(name, '')}".strip()) from error
+        raise TypeError(f"{name} must be a number, got {value!r}. {_MISSING_ADVICE.get(name, '')}".strip()) from error
 
 
 def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
@@ -209,30 +211,30 @@ def check_drawn_charge(charge_C: float, least_C: float = 0.0) -> None:
 
 
 def check_cut_off(cut_off_V: float) -> float:
-    """Refuse what is no voltage of one cell."""
-    most_V = PLAUSIBLE["voltage_V"][1]
-    if not 0.0 < cut_off_V <= most_V:
-        is_in_mV = 0.0 < 1e-3 * cut_off_V <= most_V
+    """Refuse a cut-off that is no voltage of one cell."""
+    highest_V = PLAUSIBLE["voltage_V"][1]
+    if not 0.0 < cut_off_V <= highest_V:
+        is_in_mV = 0.0 < 1e-3 * cut_off_V <= highest_V
         advice = [Advice("Give the cut-off in V, not in mV", "cut_off_V", 1e-3 * cut_off_V)] if is_in_mV else []
         raise RecordError(
-            f"the cut-off must be a voltage of one cell, above 0 and up to {most_V:g} V, got {cut_off_V:g}", advice
+            f"the cut-off must be a voltage of one cell, above 0 and up to {highest_V:g} V, got {cut_off_V:g}", advice
         )
     return cut_off_V
 
 
 def drawn_charge_C(record: Record) -> float:
-    """The charge drawn from the first sample to the last."""
-    return float(drawn(record.time_s, record.current_A, record.time_s[-1]))
+    """Return the charge drawn from the first sample to the last."""
+    return float(integrate_load(record.time_s, record.current_A, record.time_s[-1]))
 
 
 def mean_current_A(record: Record) -> float:
-    """The charge drawn over the time from the first sample to the last."""
+    """Return the mean current from the first sample to the last."""
     return drawn_charge_C(record) / float(np.ptp(record.time_s))
 
 
 class Stream(NamedTuple):
     """
-    A record as it comes in live, arrays of shape (T,).
+    A record as a live stream, arrays of shape (T,).
 
     :param time_s: s
     :param voltage_V: V
@@ -250,13 +252,12 @@ class Stream(NamedTuple):
     @classmethod
     def of(cls, record: Record, dt_s: float) -> Stream:
         """
-        Check a record and convert it. Between samples the current is linear, as
-        :func:`drawn` has it, so that the charge drawn is kept exactly.
+        Check a record and convert it; the mean currents keep the charge of :func:`integrate_load` exactly.
         """
         time_s, voltage_V, current_A = check_record(record)
         step_s = np.diff(time_s)
         if not np.allclose(step_s, dt_s, rtol=1e-6, atol=0.0):
-            mean_A = np.diff(drawn(time_s, current_A, time_s)) / step_s
+            mean_A = np.diff(integrate_load(time_s, current_A, time_s)) / step_s
             current_A = np.append(mean_A, current_A[-1])
         temperature_C = getattr(record, "temperature_C", None)
         if temperature_C is not None:
@@ -264,5 +265,6 @@ class Stream(NamedTuple):
         return cls(time_s, voltage_V, current_A, np.append(0.0, step_s), temperature_C)
 
     def samples(self) -> zip[tuple[float, float, float]]:
-        """What :meth:`battery_env.estimators.OnlineEstimator.update` takes, sample by sample."""
+        """Return the arguments of :meth:`battery_env.estimators.OnlineEstimator.update`, sample by sample."""
+
         return zip(self.voltage_V.tolist(), self.current_A.tolist(), self.dt_s.tolist(), strict=True)

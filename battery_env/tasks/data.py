@@ -1,4 +1,4 @@
-"""The data sets that the calibration tasks draw from."""
+"""The standard data sets of the calibration tasks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _Discharges = TypeVar("_Discharges")
 LoadKind = Literal["paper", "constant", "piecewise", "random_walk"]
 Split = Literal["train", "test", "all"]
 
-#: Discharges in a data set, but for the paper's.
+#: Discharges in a data set, except the paper's.
 DISCHARGES = 1000
 #: Seed of ages, loads and of the division into train and test: all data sets of a parameter hold the same cells.
 SEED = 0
@@ -42,8 +42,8 @@ def standard_dataset(
     path: AgingPath | None = None,
 ) -> TrajectoryDataset:
     """
-    A data set of cells of which one parameter has aged or both have, or one side of its 70/30 split by trajectory, made once
-    per process. All are at power, isothermal, and follow the seed 0.
+    Return a data set of cells with one aged parameter or two, or one side of its 70/30 split by trajectory, made once per
+    process. All discharges are at power, isothermal, and from seed 0.
 
     =============== ============================================================== ============ ============== ==========
     load            what                                                           q_mobile     r_o            discharges
@@ -65,8 +65,8 @@ def standard_dataset(
     return _splits(aged_parameters(parameters), load, dt_s, mismatch, cell, path)[split]
 
 
-def opened(dataset: _Discharges | str | os.PathLike[str]) -> _Discharges | TrajectoryDataset:
-    """Discharges that are given in place of a standard data set."""
+def open_dataset(dataset: _Discharges | str | os.PathLike[str]) -> _Discharges | TrajectoryDataset:
+    """Return the discharges of an argument ``dataset``, from a file if it is a path."""
     if isinstance(dataset, (str, os.PathLike)):
         return _loaded(os.fspath(dataset), os.stat(dataset).st_mtime_ns)
     return dataset
@@ -87,16 +87,16 @@ def _splits(
     path: AgingPath | None,
 ) -> dict[Split, TrajectoryDataset]:
     if path is not None:
-        whole = TrajectoryDataset.along(path, DISCHARGES, _loads(load), SEED, dt_s)
+        cells = TrajectoryDataset.along(path, DISCHARGES, _loads(load), SEED, dt_s)
     elif load == "paper" and len(parameters) == 1 and dt_s == 1.0 and mismatch == 0.0 and cell == NEW_CELL:
-        whole = TrajectoryDataset.paper(parameters[0])
+        cells = TrajectoryDataset.paper(parameters[0])
     else:
         ranges = PAPER_RANGES if load == "paper" else {"q_mobile": Q_MOBILE_RANGE_C, "r_o": R_O_RANGE_OHM}
         q_C, r_ohm, loads = ranges["q_mobile"], ranges["r_o"], _loads(load)
-        whole = TrajectoryDataset.generate(parameters, DISCHARGES, loads, SEED, q_C, r_ohm, dt_s, cell=cell, mismatch=mismatch)
-        whole = whole.trimmed(*PAPER_TRIM) if load == "paper" else whole
-    train, test = whole.split(test=TEST_SHARE, seed=SEED)
-    return {"train": train, "test": test, "all": whole}
+        cells = TrajectoryDataset.generate(parameters, DISCHARGES, loads, SEED, q_C, r_ohm, dt_s, cell=cell, mismatch=mismatch)
+        cells = cells.trimmed(*PAPER_TRIM) if load == "paper" else cells
+    train, test = cells.split(test=TEST_SHARE, seed=SEED)
+    return {"train": train, "test": test, "all": cells}
 
 
 def _loads(load: LoadKind) -> list[Load] | LoadSampler:

@@ -20,29 +20,29 @@ _RENDER_MODES = ["rgb_array"]
 
 
 def task_class(task: str | type[CalibrationTask]) -> type[CalibrationTask]:
-    """The class of a task."""
+    """Return the class of a task."""
     if not isinstance(task, str):
         return task
     module, _, name = task.partition(":")
-    found: type[CalibrationTask] = getattr(import_module(module), name)
-    return found
+    loaded: type[CalibrationTask] = getattr(import_module(module), name)
+    return loaded
 
 
 def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str, Any]) -> CalibrationTask:
-    """A task for some cells."""
-    kind: Any = task_class(task)  # of a class of its own, not of the base
-    known = kind.options()
-    unknown = options.keys() - known.keys()
+    """Make a task for a number of cells."""
+    task_type: Any = task_class(task)  # a subclass, whose arguments the base class does not declare
+    defaults = task_type.options()
+    unknown = options.keys() - defaults.keys()
     if unknown:
-        # In the words of Python, which libraries look for: TorchRL tries each environment with a ``frameskip``
-        named = ", ".join(map(repr, sorted(unknown)))
-        raise TypeError(f"got an unexpected keyword argument {named}. There are {', '.join(sorted(known))}")
-    made: CalibrationTask = kind(cells, **options)
-    return made
+        # Python's own message, which libraries look for: TorchRL tries each environment with a ``frameskip``
+        names = ", ".join(map(repr, sorted(unknown)))
+        raise TypeError(f"got an unexpected keyword argument {names}. There are {', '.join(sorted(defaults))}")
+    instance: CalibrationTask = task_type(cells, **options)
+    return instance
 
 
 def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:
-    """What one cell of a task shows and takes."""
+    """Return the observation space and the action space of one cell."""
     limit = OBSERVATION_LIMIT
     return (
         gym.spaces.Box(-limit, limit, shape=(task.observation_size,), dtype=np.float32),
@@ -52,17 +52,17 @@ def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:
 
 class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
-    A calibration task for one cell. The reward is minus the cost, and ``info`` holds the cost and what
-    :meth:`~battery_env.tasks.base.CalibrationTask.report` says. ``help(env.task)`` describes what is observed,
-    done, paid and can be chosen.
+    A calibration task for one cell. The reward is minus the cost, and ``info`` holds the cost and the
+    :meth:`~battery_env.tasks.base.CalibrationTask.report`. ``help(env.task)`` describes observations, actions, costs and
+        options.
 
-    :param task: the class of the task, or where it is, as ``"module:name"``
+    :param task: the class of the task, or its path, as ``"module:name"``
     :param render_mode: ``"rgb_array"`` or ``None``
     :param options: of the task
     :raises TypeError: for an option that the task does not have
     :raises ValueError: for values out of range
-    :cvar metadata: what Gymnasium asks for, and ``discount``, the discount factor that the tasks are for, which LAC takes by
-        default: a wrong parameter shows within a second or a decision, and what lies further ahead only blurs it
+    :cvar metadata: Gymnasium's entries, and ``discount``, the discount factor of the tasks, LAC's default. A wrong parameter
+        shows within a second or a decision; later costs only add noise
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (as in gym.Env)
@@ -105,7 +105,7 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
         :param action: shape (number of parameters,), in [-1, 1]
         :return: observation, reward (minus the cost), terminated (never), truncated (end of the episode or of the data), info
-        :raises ValueError: for an action of another shape, NaN, or what is no number
+        :raises ValueError: for an action of another shape, NaN, or a value that is no number
         """
         task = self.task
         cost = task.advance(np.asarray(action)[None]).item()
@@ -120,12 +120,9 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """
-        A picture of the episode so far, of the cell and of the model, shape (height, width, 3), or ``None`` without a render
-        mode.
-        """
+        """Return a picture of the episode so far, shape (height, width, 3), or ``None`` without a render mode."""
         if self.render_mode is None:
             return None
-        from battery_env.tasks.rendering import draw_frame  # matplotlib only for those who look
+        from battery_env.tasks.rendering import draw_frame  # matplotlib takes long to import
 
         return draw_frame(self._history, self.task)

@@ -6,7 +6,7 @@ from gymnasium.envs.registration import register, registry
 
 _PACKAGE = "battery_env.tasks"
 
-#: By id, the task that the environments for one cell and for many run; their pages are in docs/environments.
+#: The task of each id, for the environments of one cell and of many; their pages are in docs/environments.
 TASKS: dict[str, str] = {
     "BatteryQmax-v0": f"{_PACKAGE}.full_state.full_state_task:BatteryQmax",
     "BatteryRo-v0": f"{_PACKAGE}.full_state.full_state_task:BatteryRo",

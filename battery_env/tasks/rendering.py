@@ -16,7 +16,7 @@ _LABELS = {"voltage": "voltage (V)", "q_mobile": "$q_{max}$ (C)", "r_o": "$R_o$ 
 
 
 def draw_frame(history: Sequence[dict[str, Any]], task: CalibrationTask) -> NDArray[np.uint8]:
-    """Draw voltage and parameters over an episode of a task, of the cell and of the model."""
+    """Draw voltage and parameters of cell and model over an episode of a task."""
     figure = Figure(figsize=(6, 4), dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     time = task.decision_s * np.arange(1, len(history) + 1)

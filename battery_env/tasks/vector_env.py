@@ -26,11 +26,11 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
     With the same seeds it makes the episodes of as many scalar environments, to the bit. As in Gymnasium, seed s gives cell n
     the seed s + n, and ``info`` holds arrays of shape (num_envs,), with the cells that they are valid for under ``_name``.
 
-    :param task: the class of the task, or where it is, as ``"module:name"``
+    :param task: the class of the task, or its path, as ``"module:name"``
     :param num_envs: number of cells
-    :param autoreset_mode: when a cell whose episode is over is started again: ``NEXT_STEP``: by the step that follows, whose
-        action does nothing to it; ``SAME_STEP``: at once, with ``final_obs`` and ``final_info`` in ``info``. The mode or its
-        value, a string
+    :param autoreset_mode: when a cell restarts after its episode: ``NEXT_STEP``: by the following step, which ignores the
+        action of the cell; ``SAME_STEP``: at once, with ``final_obs`` and ``final_info`` in ``info``. The mode or its value, a
+        string
     :param options: of the task
     :raises TypeError: for an option that the task does not have
     :raises ValueError: for values out of range
@@ -57,7 +57,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators: list[np.random.Generator] = []
-        self._over: Mask = np.zeros(num_envs, dtype=np.bool_)
+        self._needs_reset: Mask = np.zeros(num_envs, dtype=np.bool_)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -65,7 +65,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         """
         Start an episode in every cell.
 
-        :param seed: seed of this and the following episodes: one a cell, or the first cell's, from which the others count up
+        :param seed: seed of this and the following episodes: one a cell, or a number s, which gives cell n the seed s + n
         :param options: choices that replace random draws; the page of the environment names them
         :return: observations, info
         :raises ValueError: for a wrong number of seeds
@@ -76,13 +76,13 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
             seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed must be one number, or one for each of the {self.num_envs} cells, got {len(seeds)}")
-        before: list[np.random.Generator | None] = [*self._generators] or [None] * self.num_envs
+        generators: list[np.random.Generator | None] = [*self._generators] or [None] * self.num_envs
         self._generators = [
             seeding.np_random(value)[0] if generator is None or value is not None else generator
-            for generator, value in zip(before, seeds, strict=True)
+            for generator, value in zip(generators, seeds, strict=True)
         ]
-        self._over = np.zeros(self.num_envs, dtype=np.bool_)
-        self._start(~self._over, options)
+        self._needs_reset = np.zeros(self.num_envs, dtype=np.bool_)
+        self._start(~self._needs_reset, options)
         return self.task.observation(), self._info(np.zeros(self.num_envs))
 
     def step(self, actions: NDArray[np.float32]) -> tuple[NDArray[np.float32], FloatArray, Mask, Mask, dict[str, Any]]:
@@ -97,19 +97,19 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
             raise gym.error.ResetNeeded("call reset() before step()")
         cost = self.task.advance(actions)
         reward, truncated, final = -cost, self.task.truncated(), {}
-        started = None
-        if self._over.any():
-            started = self._over
-            self._start(started)
-            reward[started], truncated[started] = 0.0, False
+        reset_mask = None
+        if self._needs_reset.any():
+            reset_mask = self._needs_reset
+            self._start(reset_mask)
+            reward[reset_mask], truncated[reset_mask] = 0.0, False
         elif self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
-            started = truncated
-            final = self._final(started, cost)
-            self._start(started)
-        if started is not None:
-            cost[started] = 0.0
+            reset_mask = truncated
+            final = self._final(reset_mask, cost)
+            self._start(reset_mask)
+        if reset_mask is not None:
+            cost[reset_mask] = 0.0
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            self._over = truncated.copy()
+            self._needs_reset = truncated.copy()
         info = {**final, **self._info(cost)}
         return self.task.observation(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, info
 

@@ -316,9 +316,9 @@ class TestTask:
         task = VoltageTask(4, dataset=data, path=path, cost="state", new_readings=(0, 0))
         task.start(np.arange(4), [np.random.default_rng(k) for k in range(4)])
         assert task.observation().shape == (4, 120)
-        fitted, (low, high) = task.fitted(), np.transpose(list(ESTIMATE_RANGES.values()))
+        fit, (low, high) = task.fit(), np.transpose(list(ESTIMATE_RANGES.values()))
         task.advance(np.tile([0.25, -0.5], (4, 1)))
-        np.testing.assert_allclose(task.estimate, np.clip(fitted.estimate + [0.5, -1.0] * fitted.sd, low, high))
+        np.testing.assert_allclose(task.estimate, np.clip(fit.estimate + [0.5, -1.0] * fit.sd, low, high))
 
     @pytest.mark.attacks
     def test_intervals_along_the_path_hold(self, path):
@@ -340,8 +340,6 @@ class TestTask:
         for others in ({"nuisance": 0.2}, {"mismatch": 0.2}):
             with pytest.raises(ValueError, match="path says how far constants are off"):
                 VoltageTask(1, path=path, **others)
-        with pytest.raises(ValueError, match="path says how far constants are off"):
-            VoltageTask(1, parameters=["q_mobile"], path=path)
 
     def test_irregular_readings_are_drawn(self, path):
         data = TrajectoryDataset.along(path, 4, [LOAD], seed=3)

@@ -12,7 +12,7 @@ from scipy.io import savemat
 from battery_env.files import call_alone
 from battery_env.lab.readers import nasa
 from battery_env.lab.readers.discharges import read_discharges
-from battery_env.records import drawn, resample_current
+from battery_env.records import integrate_load, resample_current
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge, load_nasa_discharges
 from tests.sweeps import sweep
 
@@ -185,7 +185,7 @@ class TestResampling:
         current_A = np.random.default_rng(seed).choice([0.0, 0.05, 1.9, 2.0, 2.1], size=len(time_s))
         assume(not np.allclose(np.diff(time_s), dt_s))  # such records are simulated ones, taken as they are
         n_steps = int(np.ceil(time_s[-1] / dt_s)) + 1
-        drawn_C = float(drawn(time_s, current_A, n_steps * dt_s))
+        drawn_C = float(integrate_load(time_s, current_A, n_steps * dt_s))
         assert dt_s * resample_current(time_s, current_A, dt_s, n_steps).sum() == pytest.approx(drawn_C, abs=1e-9)
 
 

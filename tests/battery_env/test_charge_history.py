@@ -118,7 +118,7 @@ class TestCharge:
     def test_one_that_tapered_off_proves_a_full_cell_without_a_rest(self, rest_rows):
         table = cycled(4.2, 0.05, rest_rows)
         (found,) = calibrate(table)
-        assert found.settled and is_right(found) and found.record.history.charge.tapered
+        assert found.settled and is_right(found) and found.record.history.charge.is_tapered
         assert found.capacity_Ah == pytest.approx(found.drawn_Ah)
         # in whichever cycle it is counted
         counted = table.assign(cycle=np.where(table.current_A <= 0.0, 2, 1) if rest_rows == 0 else 1)
@@ -129,7 +129,7 @@ class TestCharge:
         # about the charge that an exponential would have brought after its end
         left_C = last_A * 2000.0 / np.log(3.0 / last_A)
         (found,) = calibrate(cycled(4.2, last_A, rest_rows=1))
-        assert found.record.history.charge.left_C == pytest.approx(left_C, rel=0.15)
+        assert found.record.history.charge.taper_remainder_C == pytest.approx(left_C, rel=0.15)
         assert found.sd_q_mobile_C > left_C and found.capacity_Ah == pytest.approx(found.drawn_Ah)
         assert settled is None or found.settled_q_mobile == settled == ("had some left to take" not in found.reason)
 
@@ -153,16 +153,16 @@ class TestCharge:
         assert found.settled == (not reason) and reason in found.reason and is_right(found)
 
     @pytest.mark.parametrize(
-        ("share", "tapered"), [(0.0999, True), (0.1003, True), (0.104, True), (0.11, False), (0.2, False)]
+        ("share", "is_tapered"), [(0.0999, True), (0.1003, True), (0.104, True), (0.11, False), (0.2, False)]
     )
-    def test_one_that_ended_at_a_tenth_by_a_reading_before_it_tapered_off(self, share, tapered):
+    def test_one_that_ended_at_a_tenth_by_a_reading_before_it_tapered_off(self, share, is_tapered):
         current_A = -np.append(np.full(50, 3.0), 3.0 * np.linspace(share + 0.02, share, 50))
         voltage_V = np.append(np.linspace(3.8, 4.2, 50), np.full(50, 4.2))
-        assert ChargeBefore.of(10.0 * np.arange(100), voltage_V, current_A).tapered == tapered
+        assert ChargeBefore.of(10.0 * np.arange(100), voltage_V, current_A).is_tapered == is_tapered
 
     def test_noise_at_its_end_is_no_taper(self):
         voltage_V, current_A = np.append(np.linspace(3.8, 4.1, 50), 4.0), -np.append(np.full(50, 3.0), 0.02)
-        assert not ChargeBefore.of(10.0 * np.arange(51), voltage_V, current_A).tapered
+        assert not ChargeBefore.of(10.0 * np.arange(51), voltage_V, current_A).is_tapered
 
     def test_nothing_is_known_of_other_records(self):
         assert REAL.history == ChargeHistory() and REAL.loaded_part(2.7).history.charge is None
@@ -236,8 +236,8 @@ class TestSwitches:
         pulsed = replace(REAL, current_A=current_A)
         counted = replace(pulsed, history=ChargeHistory(is_counted=True))
         # but of the moment at which the load came on
-        assert pulsed.unseen_C > 0.02 * pulsed.charge_C and 0.0 < counted.unseen_C < 0.02 * pulsed.unseen_C
+        assert pulsed.sd_charge_C > 0.02 * pulsed.charge_C and 0.0 < counted.sd_charge_C < 0.02 * pulsed.sd_charge_C
         sure, unsure = (
             evidence_of(Samples.of(each), NEW_CELL, 1.0, (6000.0, 0.1), each.history) for each in (counted, pulsed)
         )
-        assert unsure.unseen_C == pytest.approx(np.hypot(sure.unseen_C, pulsed.unseen_C), rel=0.01)
+        assert unsure.sd_charge_C == pytest.approx(np.hypot(sure.sd_charge_C, pulsed.sd_charge_C), rel=0.01)

@@ -15,7 +15,7 @@ import pytest
 import battery_env
 from battery_env import Calibration, Discharge, PolicyEstimator, Settings, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
-from battery_env.electrochemistry.model_error import memory_share
+from battery_env.electrochemistry.model_error import correlation_share
 from battery_env.estimates.findings import Reason
 from battery_env.estimators.cell_fit import read_cell
 from battery_env.lab.calibrate import calibrate as calibrated
@@ -185,7 +185,7 @@ def test_the_end_is_as_unsure_as_the_voltage_at_the_cut_off():
     settings = Settings(cut_off_V=3.5, prior_q_mobile_C=(6000.0, 20.0))
     row = calibrated(record, settings).row()
     # the voltage measured pins the error down, until more charge is drawn
-    left = np.exp(-2.0 * row["remaining_s"] / 6000.0 / memory_share("forecast"))
+    left = np.exp(-2.0 * row["remaining_s"] / 6000.0 / correlation_share("forecast"))
     off_V = 0.05 * np.sqrt(1.0 - left**2)
     early_s, late_s = np.interp([-3.5 - off_V, -3.5 + off_V], -true.voltage_V, true.time_s)
     expected_s = np.hypot(row["sd_q_mobile_C"] / 2.0, 0.5 * (late_s - early_s))
@@ -333,8 +333,9 @@ def test_no_capacity_is_stated_where_the_current_sensor_fails(recorded):
 def test_what_is_drawn_after_the_cut_off_is_told(recorded):
     time_s = np.append(recorded.time_s, recorded.time_s + recorded.time_s[-1] + 100.0)  # too soon for a charge between
     columns = (np.append(column, column) for column in (recorded.voltage_V, recorded.current_A))
-    with pytest.warns(UserWarning, match="Ah more are drawn after the cut-off at"):
+    with pytest.warns(UserWarning, match="Ah more are drawn after the cut-off at") as warned:
         assert np.isnan(battery_env.calibrate(Discharge(time_s, *columns)).capacity_Ah)
+    assert warned[0].filename == __file__
 
 
 @pytest.fixture(scope="module")

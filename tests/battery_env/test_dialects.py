@@ -159,7 +159,7 @@ def test_whatever_is_put_together_the_discharges_are_those_that_were_written(tmp
             assert re.search(said, str(refused)), refused
             return
     assert len(found) == f["cycles"]
-    unseen_C = 10.0 * (1 + f["cut"] + (f["edge"] == "mixed"))  # a row that is missing, or of two steps
+    sd_charge_C = 10.0 * (1 + f["cut"] + (f["edge"] == "mixed"))  # a row that is missing, or of two steps
     for discharge in found:
-        assert abs(discharge.charge_C - DRAWN_C) <= 3e-3 * DRAWN_C + unseen_C + 2.5 * discharge.unseen_C
+        assert abs(discharge.charge_C - DRAWN_C) <= 3e-3 * DRAWN_C + sd_charge_C + 2.5 * discharge.sd_charge_C
         assert discharge.temperature_C is None or (discharge.temperature_C == 24.0).all()

@@ -11,7 +11,7 @@ import pytest
 from battery_env import NEW_CELL, Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
 from battery_env.__main__ import calibrate
 from battery_env.electrochemistry.equilibrium import with_equilibrium
-from battery_env.electrochemistry.model_error import WHOLE_ERROR
+from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.estimates import Finding
 from battery_env.lab.calibrate import calibrate as calibrate_record
 from battery_env.lab.running import forecast_end, read_load
@@ -151,7 +151,7 @@ class TestUncertainty:
         )
         own_s = 3.29 * 0.5 * (high_s - low_s)
         # beside what the estimate states, however sure that is
-        absorbed_s = np.sqrt(WHOLE_ERROR**2 - 1.0) * own_s
+        absorbed_s = np.sqrt(UNFITTED_ERROR_RATIO**2 - 1.0) * own_s
         sure_s = self.width(TRUTH, 1.0, mismatch_V=0.05)
         assert absorbed_s < sure_s < 1.5 * absorbed_s
         assert self.width(unsure, 1.0, mismatch_V=0.05) == pytest.approx(np.hypot(own_s, sure_s), rel=0.1)

@@ -39,12 +39,16 @@ def action_of(task, values):
 
 
 def true_action(task):
-    return action_of(task, task.now)
+    return action_of(task, task.cell_records)
 
 
 def errors_in_scales(task, measured):
     return dict(
-        zip(STATE_NAMES[OBSERVED], np.abs((task.now["model_state"] - measured)[:, OBSERVED] / ERROR_SCALE).T, strict=True)
+        zip(
+            STATE_NAMES[OBSERVED],
+            np.abs((task.cell_records["model_state"] - measured)[:, OBSERVED] / ERROR_SCALE).T,
+            strict=True,
+        )
     )
 
 
@@ -52,8 +56,8 @@ def test_the_defaults_disturb_nothing(discharges):
     task = started(make(discharges))
     for k in range(5):
         trajectory = discharges[2]
-        np.testing.assert_array_equal(task.now["state"][0], trajectory.state[300 + k])
-        np.testing.assert_array_equal(task.now["next_state"][0], trajectory.state[301 + k])
+        np.testing.assert_array_equal(task.cell_records["state"][0], trajectory.state[300 + k])
+        np.testing.assert_array_equal(task.cell_records["next_state"][0], trajectory.state[301 + k])
         task.advance(np.zeros((1, 1)))
 
 
@@ -72,15 +76,15 @@ def test_the_second_innovation_does_not_see_the_drift_of_the_model(discharges):
 def test_a_parameter_is_judged_by_the_voltage_that_shows_it(discharges, kind, voltages):
     task = started(make(discharges, kind, cells=4, initial_perturbation=8.0))
     for _ in range(3):
-        measured = task.now["next_state"].copy()
+        measured = task.cell_records["next_state"].copy()
         cost, errors = task.advance(np.zeros((4, len(task.parameters)))), errors_in_scales(task, measured)
         np.testing.assert_allclose(cost, sum(np.minimum(errors[name], 5.0) for name in voltages), rtol=1e-9)
 
 
 def test_the_cost_of_the_paper_counts_all_states(discharges):
     task = started(make(discharges, BatteryQmaxPaper, cells=2, initial_perturbation=3.0))
-    measured = task.now["next_state"].copy()
-    cost, error = task.advance(true_action(task)), task.now["model_state"] - measured
+    measured = task.cell_records["next_state"].copy()
+    cost, error = task.advance(true_action(task)), task.cell_records["model_state"] - measured
     half = 0.5 * (np.linalg.norm(error[:, VO:QNB], axis=1) + np.linalg.norm(error[:, QNB:], axis=1))
     np.testing.assert_allclose(cost, half * np.where(half > 1e-4, 50.0, 1.0), rtol=1e-9)
 
@@ -91,19 +95,19 @@ def test_a_cell_whose_data_have_ended_goes_on_without_failing(discharges):
     for _ in range(5):
         task.advance(np.zeros((1, 1)))
         assert task.truncated() and np.isfinite(task.observation()).all()
-    assert task.now["load"] == discharges[2].load[-1]
+    assert task.cell_records["load"] == discharges[2].load[-1]
 
 
 def test_episodes_go_on_with_a_probability(discharges):
     cells, probability = 2000, 0.5
     task = make(discharges, cells=cells, episode_steps=3, continue_probability=probability)
     task.start(np.arange(cells), [np.random.default_rng(n) for n in range(cells)])
-    lengths = task.now["steps"] // 3
-    assert (task.now["steps"] % 3 == 0).all() and lengths.min() == 1
+    lengths = task.cell_records["steps"] // 3
+    assert (task.cell_records["steps"] % 3 == 0).all() and lengths.min() == 1
     # geometric: 4 standard errors around the mean of 1 / (1 - p)
     assert abs(lengths.mean() - 2.0) < 4.0 * np.sqrt(2.0 / cells)
-    task.now, task.cells = task.now[lengths == 2], int((lengths == 2).sum())
-    data_last = task.now["sample"] + 6 < task.now["last_decision"]
+    task.cell_records, task.cells = task.cell_records[lengths == 2], int((lengths == 2).sum())
+    data_last = task.cell_records["sample"] + 6 < task.cell_records["last_decision"]
     for k in range(1, 7):
         task.advance(np.zeros((task.cells, 1)))
         assert (task.truncated()[data_last] == (k == 6)).all()
@@ -115,10 +119,10 @@ def test_a_share_of_the_episodes_starts_where_the_whole_discharge_does():
     for probability, low, high in ((0.0, 0, 0), (0.25, 60, 140), (1.0, cells, cells)):
         task = make(discharges, cells=cells, first_sample_probability=probability)
         task.start(np.arange(cells), [np.random.default_rng(n) for n in range(cells)])
-        at_rest = task.now["sample"] == 0
+        at_rest = task.cell_records["sample"] == 0
         assert low <= at_rest.sum() <= high
     chosen = started(make(discharges, first_sample_probability=1.0))
-    assert chosen.now["sample"] == 300  # what is asked for counts
+    assert chosen.cell_records["sample"] == 300  # what is asked for counts
 
 
 @pytest.mark.parametrize("kind", [BatteryQmax, BatteryRo, BatteryJoint])
@@ -237,9 +241,9 @@ def test_the_perturbation_stays_in_its_bounds_and_conserves_charge():
     draws = []
     for seed in range(20):
         env.reset(seed=seed)
-        now = env.unwrapped.task.now
-        draws.append((now["model_state"] - now["state"])[0, OBSERVED][:4] / scale[:4])
-        assert now["model_state"][0, QNB:].sum() == pytest.approx(now["state"][0, QNB:].sum(), rel=1e-12)
+        cell_records = env.unwrapped.task.cell_records
+        draws.append((cell_records["model_state"] - cell_records["state"])[0, OBSERVED][:4] / scale[:4])
+        assert cell_records["model_state"][0, QNB:].sum() == pytest.approx(cell_records["state"][0, QNB:].sum(), rel=1e-12)
     assert np.abs(draws).max() <= 10.0 + 1e-6 and np.abs(draws).max(axis=0).min() > 5.0
 
 

@@ -9,7 +9,7 @@ from battery_env.electrochemistry.cell import POLYNOMIAL_SIZE
 from battery_env.loads import RandomPiecewise
 from battery_env.records import Samples
 from battery_env.tasks.vector_env import CalibrationVectorEnv
-from battery_env.tasks.voltage.fit import Known, found_size, nuisance_step
+from battery_env.tasks.voltage.fit import StepPrior, nuisance_step, solution_size
 from battery_env.tasks.voltage.readings import Readings
 from battery_env.tasks.voltage.voltage_task import VoltageTask
 from tests.policies import Step
@@ -25,27 +25,27 @@ def data(aged_both):
 
 def step(record, q_mobile, r_o, logarithms=(0.0, 0.0, 0.0, 0.0), prior_sd=KNOWS_NOTHING, count=None):
     """One step for one record, read every two seconds."""
-    readings, found = Readings.of([record], 2.0), np.full((1, found_size(len(UNKNOWNS))), np.nan)
-    nothing = np.eye(len(UNKNOWNS))
+    readings, solution = Readings.of([record], 2.0), np.full((1, solution_size(len(UNKNOWNS))), np.nan)
+    identity = np.eye(len(UNKNOWNS))
     nuisance_step(
         np.arange(1),
         readings.count if count is None else np.array([count]),
         np.array([[q_mobile, r_o]]),
-        np.ascontiguousarray(readings.shown(0)[:, None]),
+        np.ascontiguousarray(readings.exact_measurements(0)[:, None]),
         readings.model,
         np.array([logarithms]),
         np.zeros((0, 1 + POLYNOMIAL_SIZE)),
-        Known(
+        StepPrior(
             np.array([[q_mobile, r_o, 0.0, 0.0, 0.0, 0.0, 0.0]]),
             np.array([prior_sd], dtype=np.float64),
-            precision=nothing,
-            alone=nothing,
+            precision=identity,
+            flat_precision=identity,
             mismatch_V=0.0,
             errors_per_C=0.0,
         ),
-        found,
+        solution,
     )
-    return found[0]
+    return solution[0]
 
 
 def cell_that_is_off(trajectory, unknown, size):

@@ -533,9 +533,9 @@ def test_a_voltage_below_the_cut_off_is_refused_with_one_that_is_reached(lowest_
 @pytest.mark.parametrize("gain", [0.5, 0.97, 1.03, 2.0])
 def test_another_count_of_the_tester_is_a_doubt_of_its_size(gain):
     discharge = read(TABLE.assign(**{"Capacity(mAh)": 1e3 * gain * COUNTED_AH}), "the tester counted")
-    assert discharge.history.uncounted_C == pytest.approx(abs(gain - 1.0) * 3600.0 * COUNTED_AH[-1], rel=0.1)
+    assert discharge.history.sd_counter_C == pytest.approx(abs(gain - 1.0) * 3600.0 * COUNTED_AH[-1], rel=0.1)
     found = calibrate(discharge)
-    assert found.sd_q_mobile_C > 0.95 * discharge.history.uncounted_C and not found.settled_q_mobile
+    assert found.sd_q_mobile_C > 0.95 * discharge.history.sd_counter_C and not found.settled_q_mobile
     assert "the tester counted another charge" in found.reason
 
 
@@ -546,7 +546,7 @@ def test_a_count_that_starts_anew_while_the_load_is_switched_tells_nothing_of_th
     table = pd.DataFrame({"Time (s)": time_s, "Current (A)": -np.select([pulse, load], [8.0, 2.0], 0.0)})
     table["Voltage (V)"] = 4.1 - 2e-4 * time_s + 0.1 * table["Current (A)"]
     found = read(table.assign(**{"Capacity (mAh)": np.where(load, 2.0 * (time_s % 600.0) / 3.6, 0.0)}))
-    assert found.history.uncounted_C < 0.01 * found.charge_C < found.unseen_C and not found.history.is_counted
+    assert found.history.sd_counter_C < 0.01 * found.charge_C < found.sd_charge_C and not found.history.is_counted
 
 
 def test_workbooks_are_read_by_the_sheet_of_the_record_and_those_that_continue_it(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from battery_env import TrajectoryDataset
 from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.loads import RandomPiecewise
-from battery_env.tasks.voltage.readings import SENSOR_ROWS, Readings, explain
+from battery_env.tasks.voltage.readings import SENSOR_ROWS, Readings, summarise_residuals
 
 
 def compare(readings, q_mobile, r_o, count=None, stretches=12):
@@ -14,10 +14,10 @@ def compare(readings, q_mobile, r_o, count=None, stretches=12):
     n = len(readings)
     shown = np.zeros((SENSOR_ROWS, n, readings.count.max()))
     for k in range(n):
-        shown[:, k, : readings.count[k]] = readings.shown(k)
+        shown[:, k, : readings.count[k]] = readings.exact_measurements(k)
     means, rms_V, last_V = np.full((3, n, stretches, 2), np.nan), np.full(n, np.nan), np.full(n, np.nan)
     count = readings.count if count is None else count
-    explain(np.arange(n), count, np.column_stack([q_mobile, r_o]), shown, readings.model, means, rms_V, last_V)
+    summarise_residuals(np.arange(n), count, np.column_stack([q_mobile, r_o]), shown, readings.model, means, rms_V, last_V)
     return [*means, rms_V, last_V]
 
 
@@ -30,7 +30,7 @@ def test_misfit_is_that_of_a_whole_simulation(aged_both, readings):
             trajectory.current_A, 7600.0, 0.15, load_unit="current", cut_off_V=-np.inf, until=len(trajectory.time_s)
         )
         modelled_V = model.voltage_V[10 : 10 * readings.count[n] + 1 : 10]
-        exact_V = np.sqrt(np.mean((readings.voltage_V[readings.part(n)] - modelled_V) ** 2))
+        exact_V = np.sqrt(np.mean((readings.voltage_V[readings.rows_of(n)] - modelled_V) ** 2))
         assert rms_V[n] == pytest.approx(exact_V, abs=2e-4)
         assert last_V[n] == pytest.approx(modelled_V[-1], abs=1e-3)
 

@@ -170,7 +170,7 @@ def test_options_are_those_of_the_environment_and_the_same_for_all(problems):
     env = GymnasiumVecEnv(problems["battery"][0]("SameStep"))
     env.set_options({"trajectory": 2, "sample": 100})
     env.reset()
-    np.testing.assert_array_equal(env.env.unwrapped.task.now["trajectory"], 2)
+    np.testing.assert_array_equal(env.env.unwrapped.task.cell_records["trajectory"], 2)
     env.set_options([{"trajectory": n} for n in range(N_ENVS)])
     with pytest.raises(ValueError, match="the same options for all"):
         env.reset()

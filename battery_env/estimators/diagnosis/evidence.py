@@ -31,21 +31,21 @@ from battery_env.records.load import switched_charge
 @dataclass(frozen=True)
 class Evidence:
     """
-    What the samples of a record say beside an estimate. Times are since its first sample.
+    Evidence of the samples of a record for or against an estimate. Times are since its first sample.
 
     :param first_V: the first voltage
-    :param first_A: the current there; 0: at rest
-    :param start_V: the voltage to expect at the start; NaN: none is
-    :param usual_A: the current at which other discharges of the cell tell it
-    :param start: why the cell need not have started with the charge expected; ``None``: its first voltage shows that it did
-    :param fault: what no cell does, the first one
-    :param dropouts: changes of the current for a moment that the voltage does not follow
-    :param charges_C: standard deviations of the charge by what nobody saw
-    :param missed_C: charge that steps of the voltage show, and the current does not
-    :param offset_A: the current before the load, in the mean
-    :param gap_s: where the last gap lies
-    :param switches: how many switches of the load lie between two samples
-    :param is_smeared: whether these are so many that samples do not tell which current a voltage belongs to
+    :param first_A: the current at the first voltage; 0: at rest
+    :param start_V: the expected first voltage; NaN: unknown
+    :param usual_A: the current of the expected first voltage, if other discharges of the cell give it
+    :param start: why the cell may have started with another charge; ``None``: its first voltage confirms the expected charge
+    :param fault: the first fault
+    :param dropouts: momentary changes of the current that the voltage does not follow
+    :param charges_C: standard deviations of the charge, by cause
+    :param missed_C: charge that the voltage shows in steps, and the current does not
+    :param offset_A: the mean current before the load
+    :param gap_s: begin and end of the last gap
+    :param switches: number of switches of the load between samples
+    :param is_smeared: whether switches are too many to tell the current of each voltage
     """
 
     first_V: float = nan
@@ -63,12 +63,12 @@ class Evidence:
     is_smeared: bool = False
 
     @property
-    def unseen_C(self) -> float:
-        """The standard deviation of the charge by all that nobody saw, and that steps of the voltage show."""
+    def sd_charge_C(self) -> float:
+        """Root sum of squares of all uncertainties of the charge."""
         return sqrt(sum((charge_C**2 for charge_C in self.charges_C.values()), self.missed_C**2))
 
     def measured(self, initial_soc: float, clock_s: float = 0.0, charge: ChargeBefore | None = None) -> dict[str, Any]:
-        """What was measured, by the names that texts have in braces, on a clock of its own."""
+        """Return the measured values by the names in the texts of findings, with times after ``clock_s``."""
         charge = charge or ChargeBefore(nan, nan, nan, nan)
         fault = self.fault or Fault(Reason.SETTLED, nan, nan)
         return {
@@ -81,7 +81,7 @@ class Evidence:
             "charge_A": charge.last_A,
             "offset_A": self.offset_A,
             "fault_s": clock_s + fault.time_s,
-            **dict.fromkeys(("drawn_C", "change_A", "rise_V"), fault.size),  # by which fault it is
+            **dict.fromkeys(("drawn_C", "change_A", "rise_V"), fault.size),  # the text of the fault names one of them
             "dropout_s": clock_s + (self.dropouts[0].begin_s if self.dropouts else nan),
             "switches": self.switches,
             "missed_C": self.missed_C,
@@ -99,10 +99,10 @@ def evidence_of(
     model_V: FloatArray | None = None,
 ) -> Evidence:
     """
-    What the samples of a whole record show beside an estimate of ``q_mobile``, C, and ``r_o``, ohm. Without a state of charge
-    no rest is expected at the start; without the voltage of the model gaps are not looked at.
+    Return the evidence of a record for an estimate of ``q_mobile``, C, and ``r_o``, ohm. Without a state of charge there is no
+    expected start; without the voltage of the model there are no gaps.
     """
-    # another charge was stated by whoever knows it
+    # a user who states another charge knows the start
     history = history if initial_soc == 1.0 else history._replace(usual_start=None)
     (q_mobile, r_o), samples, first_V = estimate, MeasuredSamples.of(record), float(record.voltage_V[0])
     expected, rest = _ExpectedStart.of(cell, initial_soc, history), _Rest.of(record, history)
@@ -110,11 +110,11 @@ def evidence_of(
     response = samples.response(resistance_ohm)
     recovery = samples.recovery(expected.low_V, max(q_mobile, cell.q_mobile), resistance_ohm, response.switched_s)
     faults = [*response.faults, *filter(None, (samples.rise(), recovery))]
-    fault = min(faults, key=lambda each: each[0])[1] if faults else None
-    # that of load-on is judged there
-    after = slice(rest.load_on_row, None)
-    switched = switched_charge(record.time_s[after], record.current_A[after])
-    gaps = Gaps() if model_V is None else gaps_of(record, model_V, q_mobile, samples, rest.over_s)
+    fault = min(faults, key=lambda fault_at: fault_at[0])[1] if faults else None
+    # ``rest`` has the charge of load-on
+    load_rows = slice(rest.load_on_row, None)
+    switch_charge = switched_charge(record.time_s[load_rows], record.current_A[load_rows])
+    gaps = Gaps() if model_V is None else gaps_of(record, model_V, q_mobile, samples, rest.end_s)
     drawn_C = float(record.current_A[:-1] @ np.diff(record.time_s))
     return Evidence(
         first_V=first_V,
@@ -127,22 +127,22 @@ def evidence_of(
         charges_C={
             Doubt.LOAD_ON: rest.load_on_C,
             Doubt.REST_CURRENT: rest.charge_C,
-            Doubt.CHARGE_LEFT: expected.left_C(first_V, cell.q_mobile),
-            Doubt.UNCOUNTED: history.uncounted_C,
-            Doubt.DROPPED: sum(each.charge_C for each in response.dropouts),
-            Doubt.SWITCHES: 0.0 if history.is_counted else switched.sd_C,
+            Doubt.CHARGE_LEFT: expected.remaining_charge_C(first_V, cell.q_mobile),
+            Doubt.UNCOUNTED: history.sd_counter_C,
+            Doubt.DROPPED: sum(dropout.charge_C for dropout in response.dropouts),
+            Doubt.SWITCHES: 0.0 if history.is_counted else switch_charge.sd_C,
             Doubt.GAP: gaps.doubt_C,
         },
         missed_C=samples.missed_C(),
         offset_A=rest.mean_A,
         gap_s=gaps.span_s,
-        switches=switched.switches,
-        is_smeared=switched.sd_C > SETTLED_SHARES["q_mobile"] * drawn_C,
+        switches=switch_charge.switches,
+        is_smeared=switch_charge.sd_C > SETTLED_SHARES["q_mobile"] * drawn_C,
     )
 
 
 def dropouts_of(record: Samples, cell: CellParameters) -> list[Dropout]:
-    """Changes of the current of a record for a moment, until the ohmic drop of a model that follows them is over."""
+    """Return the momentary changes of the current of a record, until a model's ohmic drop after them has decayed."""
     samples = MeasuredSamples.of(record)
     return samples.response(samples.least_resistance_ohm(cell.q_mobile, cell.r_o)).dropouts
 
@@ -150,15 +150,15 @@ def dropouts_of(record: Samples, cell: CellParameters) -> list[Dropout]:
 @dataclass
 class _ExpectedStart:
     """
-    How a discharge is expected to start: as a full cell at rest does, or as other discharges of the cell do.
+    The expected start of a discharge: that of a full cell at rest, or of other discharges of the cell.
 
-    :param voltage_V: the voltage; NaN: none is
-    :param low_V: of a cell that lacks charge
-    :param high_V: of another cell
-    :param usual_A: the current under which other discharges of the cell tell these voltages; ``None``: they do not
-    :param is_full: whether the charge before filled the cell; ``None``: nothing is known of it
-    :param charge_left_C: what that charge had left to take
-    :param is_cut_short: whether that charge ended before it tapered off
+    :param voltage_V: the voltage; NaN: unknown
+    :param low_V: a cell with a lower first voltage lacks charge
+    :param high_V: a cell with a higher first voltage is another cell
+    :param usual_A: the current of these voltages, if they are of other discharges of the cell; otherwise ``None``
+    :param is_full: whether the charge before filled the cell; ``None``: unknown
+    :param taper_remainder_C: charge missing to a full cell at the end of the charge before
+    :param is_cut_short: whether the charge before ended before it tapered off
     """
 
     voltage_V: float
@@ -166,29 +166,29 @@ class _ExpectedStart:
     high_V: float
     usual_A: float | None = None
     is_full: bool | None = None
-    charge_left_C: float = 0.0
+    taper_remainder_C: float = 0.0
     is_cut_short: bool = False
 
     @classmethod
     def of(cls, cell: CellParameters, initial_soc: float | None, history: ChargeHistory) -> _ExpectedStart:
-        """That of a cell with some state of charge, and with what is known beside the samples."""
+        """Return the expected start of a cell with a state of charge and a history."""
         if initial_soc is None:
             return cls(nan, nan, nan)
         rest_V, charge = rest_voltage_V(cell, initial_soc), history.charge
         expected = cls(rest_V, low_rest_voltage_V(cell, initial_soc), rest_V + ABOVE_REST_V)
         if charge is not None:
-            # without a rest a charge that did not taper off tells nothing but that the cell is lower
-            is_low = charge.highest_V < expected.low_V or (not charge.tapered and history.rest_s < STEADY_S)
-            expected.is_full = False if is_low else charge.tapered or None
-            expected.charge_left_C, expected.is_cut_short = charge.left_C, not charge.tapered
+            # a charge that did not taper off leaves the cell below full; only a rest can show by how much
+            is_low = charge.highest_V < expected.low_V or (not charge.is_tapered and history.rest_s < STEADY_S)
+            expected.is_full = False if is_low else charge.is_tapered or None
+            expected.taper_remainder_C, expected.is_cut_short = charge.taper_remainder_C, not charge.is_tapered
         if history.start is not None and history.usual_start is not None:
-            expected._take_usual(history.start, history.usual_start)
+            expected._expect_usual(history.start, history.usual_start)
         return expected
 
-    def _take_usual(self, own: DischargeStart, usual: DischargeStart) -> None:
-        """Expect the voltage of other discharges of the cell, or their charge if the load is another one."""
-        span_V, is_of_current = self.voltage_V - self.low_V, own.is_of_current(usual)
-        is_like = own.is_charged_like(usual, span_V)
+    def _expect_usual(self, start: DischargeStart, usual: DischargeStart) -> None:
+        """Expect the voltage of other discharges of the cell, or their charge if their load differs."""
+        span_V, is_of_current = self.voltage_V - self.low_V, start.is_of_current(usual)
+        is_like = start.is_charged_like(usual, span_V)
         if not is_of_current and is_like is None:
             return
         self.voltage_V, self.usual_A = usual.voltage_V, usual.current_A
@@ -197,20 +197,20 @@ class _ExpectedStart:
             return
         spread_V = MOST_NOISE_SD * usual.sd_V
         self.low_V, self.high_V = usual.voltage_V - span_V - spread_V, usual.voltage_V + ABOVE_REST_V + spread_V
-        if own.charge is not None:
-            is_low, is_full = own.charge.highest_V < self.low_V, own.charge.tapered and is_like is not False
+        if start.charge is not None:
+            is_low, is_full = start.charge.highest_V < self.low_V, start.charge.is_tapered and is_like is not False
             self.is_full = False if is_low else is_full or None
 
-    def left_C(self, first_V: float, cell_q_mobile: float) -> float:
-        """What the charge before had left to take; of one that was cut short the voltage at rest tells it."""
+    def remaining_charge_C(self, first_V: float, cell_q_mobile: float) -> float:
+        """Return the charge missing to a full cell; after a charge that was cut short the voltage at rest gives it."""
         if not self.is_cut_short or not first_V < self.voltage_V:
-            return self.charge_left_C
+            return self.taper_remainder_C
         return LACKING_SHARE * cell_q_mobile * (self.voltage_V - first_V) / (self.voltage_V - self.low_V)
 
     def reason(self, first_V: float) -> Reason | None:
         """
-        Why a cell need not have started so; ``None`` if its first voltage shows that it did. Under load that is lower than at
-        rest by a drop that nobody knows: a cell with a larger one cannot be told from one that lacks some charge.
+        Return why a cell may have started otherwise; ``None`` if its first voltage confirms the expected start. Under load the
+        unknown ohmic drop lowers this voltage, so that it cannot show a small lack of charge.
         """
         is_other = first_V > self.high_V or (self.is_full is None and first_V < self.low_V)
         if self.usual_A is not None:
@@ -225,39 +225,40 @@ class _Rest(NamedTuple):
     The current before the load.
 
     :param mean_A: its mean
-    :param over_s: when the rest is over; 0: before the first sample, or never
-    :param load_on_row: the first sample under load; 0: the first one of all, or none
+    :param end_s: end of the rest; 0: before the first sample, or never
+    :param load_on_row: the first sample under load; 0: the first sample of all, or none
     :param load_on_C: standard deviation of the charge by the moment of load-on
-    :param charge_C: what the mean makes of the charge since then
+    :param charge_C: charge of the mean current from then on
     """
 
     mean_A: float
-    over_s: float = 0.0
+    end_s: float = 0.0
     load_on_row: int = 0
     load_on_C: float = 0.0
     charge_C: float = 0.0
 
     @classmethod
     def of(cls, record: Samples, history: ChargeHistory) -> _Rest:
-        """That of a record, or of the whole recording that it was cut from."""
+        """Return the rest of a record, or of the recording that it is a part of."""
         time_s, current_A = record.time_s - record.time_s[0], record.current_A
         if history.load_on_C or history.offset_A:
             charge_C = abs(history.offset_A) * float(time_s[-1])
             return cls(history.offset_A, load_on_C=history.load_on_C, charge_C=charge_C)
         means_A, size_A = np.cumsum(current_A) / np.arange(1, len(current_A) + 1), np.abs(current_A)
         largest_A = np.maximum(np.maximum(size_A[1:], np.abs(means_A[:-1])), REST_CURRENT_A)
-        switched = np.flatnonzero(np.abs(current_A[1:] - means_A[:-1]) > SWITCH_SHARE * largest_A)
-        if not len(switched):
+        switch_rows = np.flatnonzero(np.abs(current_A[1:] - means_A[:-1]) > SWITCH_SHARE * largest_A)
+        if not len(switch_rows):
             return cls(float(means_A[-1]))
-        before = int(switched[0])
-        mean_A, row, over_s = float(means_A[before]), before + 1, float(time_s[before + 1])
+        previous_row = int(switch_rows[0])
+        mean_A, row, end_s = float(means_A[previous_row]), previous_row + 1, float(time_s[previous_row + 1])
         is_rest = abs(mean_A) <= LOAD_SHARE * size_A.max()
-        charge_C = abs(mean_A) * float(time_s[-1] - over_s) if is_rest else 0.0
+        charge_C = abs(mean_A) * float(time_s[-1] - end_s) if is_rest else 0.0
         if abs(mean_A) > LOAD_SHARE * size_A[row]:
-            return cls(mean_A, over_s, charge_C=charge_C)
+            return cls(mean_A, end_s, charge_C=charge_C)
         interval_s = np.diff(time_s)
-        on_s, beside_s = float(interval_s[before]), [*interval_s[row : row + 1].tolist(), *interval_s[:before][-1:].tolist()]
-        if row + 1 < len(time_s) and on_s <= 2.0 * max(beside_s):
-            # unless some samples are missing, the load came on in an interval of its own samples
-            on_s = min(on_s, beside_s[0])
-        return cls(mean_A, over_s, row, on_s * abs(float(current_A[row]) - mean_A) / sqrt(3.0), charge_C)
+        on_s, earlier_s = float(interval_s[previous_row]), interval_s[:previous_row][-1:].tolist()
+        neighbour_s = [*interval_s[row : row + 1].tolist(), *earlier_s]
+        if row + 1 < len(time_s) and on_s <= 2.0 * max(neighbour_s):
+            # unless samples are missing, the load came on within one interval of the samples under load
+            on_s = min(on_s, neighbour_s[0])
+        return cls(mean_A, end_s, row, on_s * abs(float(current_A[row]) - mean_A) / sqrt(3.0), charge_C)

@@ -29,7 +29,7 @@ from battery_env.records import (
     SWITCH_SHARE,
     ChargeBefore,
     ChargeHistory,
-    drawn,
+    integrate_load,
     is_load,
 )
 from battery_env.records.discharge import LEAST_SAMPLES, Discharge
@@ -230,7 +230,7 @@ def _bounds(rows: pd.DataFrame) -> list[int]:
 def _passed_C(time_s: FloatArray, current_A: FloatArray) -> FloatArray:
     """The charge that has passed at each row, on a clock that does not go back."""
     clock_s = np.append(0.0, np.cumsum(np.maximum(np.diff(time_s), 0.0)))
-    return drawn(clock_s, current_A, clock_s)
+    return integrate_load(clock_s, current_A, clock_s)
 
 
 def _discharges(rows: pd.DataFrame, low: int, high: int) -> list[_Part]:
@@ -334,7 +334,7 @@ def _with_count(history: ChargeHistory, rows: pd.DataFrame, origin: Origin) -> C
     time_s, current_A = rows["time"].to_numpy(), rows["current"].to_numpy()
     loaded = np.flatnonzero(is_load(current_A))
     part = slice(loaded[0], loaded[-1] + 1)
-    step_C, passed_C = np.diff(rows["capacity"].to_numpy()[part]), np.diff(drawn(time_s, current_A, time_s)[part])
+    step_C, passed_C = np.diff(rows["capacity"].to_numpy()[part]), np.diff(integrate_load(time_s, current_A, time_s)[part])
     if len(loaded) < LEAST_SAMPLES or (step_C > 0.0).mean() < 0.5:
         return history
     goes_on = (step_C >= 0.0) & (passed_C >= 0.0) & (np.abs(np.diff(current_A[part])) <= SWITCH_SHARE * current_A.max())
@@ -344,4 +344,4 @@ def _with_count(history: ChargeHistory, rows: pd.DataFrame, origin: Origin) -> C
         if origin.leaves_open("time"):
             refuse_other_unit(counted_Ah, passed_Ah, told)
         say(f"{told}: check units and clock, and that all rows are there")
-    return history._replace(is_counted=bool((step_C >= 0.0).all()), uncounted_C=3600.0 * abs(passed_Ah - counted_Ah))
+    return history._replace(is_counted=bool((step_C >= 0.0).all()), sd_counter_C=3600.0 * abs(passed_Ah - counted_Ah))

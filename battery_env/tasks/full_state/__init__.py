@@ -1,1 +1,1 @@
-"""Tasks whose agent sees the whole state of a cell, as the paper has it."""
+"""The paper's tasks, whose agent observes the full state of a cell."""

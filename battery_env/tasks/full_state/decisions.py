@@ -1,5 +1,5 @@
 """
-The compiled kernels (numba) of the full-state task: a decision, a look ahead, and what the agent sees, for many cells.
+The compiled kernels (numba) of the full-state task: decision, look-ahead and observation of many cells.
 
 ``settings`` is one record of :data:`~battery_env.tasks.full_state.layout.SETTINGS`, ``cells`` an array of records of
 :data:`~battery_env.tasks.full_state.layout.CELL`, whose fields the kernels overwrite.
@@ -52,21 +52,21 @@ def _cost_of_state(model_state: FloatArray, measured: FloatArray, n: int, task: 
         return _clipped(_literal_distance(model_state, measured, n), task.cost_limit)
     cost = 0.0
     for k in range(2):
-        if task.finds[k] > 0:
-            voltage = task.judged_by[k]
+        if task.is_sought[k] > 0:
+            voltage = task.cost_states[k]
             error = model_state[n, voltage] - measured[n, voltage]
             cost += _clipped(abs(error) * task.per_error[voltage - VO], task.cost_limit)
     return cost
 
 
 @inlined
-def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> None:
+def _apply_action(action: FloatArray, task: Any, cells: Records, n: int) -> None:
     # Set the model's parameters
     cell, column = cells[n], 0
     for k in range(2):
-        if task.finds[k] > 0:
-            chosen = _clipped(action[n, column], 1.0)
-            value = task.lowest[k] + 0.5 * (chosen + 1.0) * (task.highest[k] - task.lowest[k])
+        if task.is_sought[k] > 0:
+            clipped_action = _clipped(action[n, column], 1.0)
+            value = task.lowest[k] + 0.5 * (clipped_action + 1.0) * (task.highest[k] - task.lowest[k])
             if k == 0:
                 cell.q_mobile_hat = value
             else:
@@ -76,13 +76,13 @@ def _take_action(action: FloatArray, task: Any, cells: Records, n: int) -> None:
 
 @compiled
 def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArray) -> None:
-    # Set the model's parameters, step it, and compare it with the measured state; then go on to the next sample
+    # Set the model's parameters, step it, compare it with the measured state, and move on to the next sample
     task = settings[0]
     state, next_state, model_state = cells["state"], cells["next_state"], cells["model_state"]
     for n in range(len(cells)):
         cells[n].decisions += 1
         cells[n].sample += 1
-        _take_action(action, task, cells, n)
+        _apply_action(action, task, cells, n)
     load, q, r_o = cells["load"], cells["q_mobile_hat"], cells["r_o_hat"]
     packed = PackedConstants(task.constants, task.polynomial_n, task.polynomial_p)
     step_batch(model_state, load, q, r_o, task.dt_s, task.power, task.thermal, True, packed, model_state)
@@ -94,7 +94,7 @@ def decide(action: FloatArray, settings: Records, cells: Records, cost: FloatArr
 
 @compiled
 def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray, cells: Records) -> None:
-    # The load and the cell's next state. At the end of its data a cell stays on its last sample, and is not asked for more
+    # The load and the cell's next state. At the end of its data a cell stays on its last sample
     task, block = settings[0], np.empty(BLOCK_SIZE)
     for n in range(len(cells)):
         cells[n].load = load_values[cells[n].load_start + min(cells[n].sample, cells[n].last_sample)]
@@ -111,7 +111,7 @@ def look_ahead(settings: Records, load_values: FloatArray, constants: FloatArray
 
 @compiled
 def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.float32]) -> None:
-    # The observations, into out
+    # Write the observations into out
     task = settings[0]
     per_state, per_error, model_state, next_state = task.per_state, task.per_error, cells["model_state"], cells["next_state"]
     for n in range(len(cells)):
@@ -131,8 +131,8 @@ def observe(settings: Records, cells: Records, limit: float, out: NDArray[np.flo
         for n in range(len(cells)):
             for k in range(7):
                 predicted[n, k + 1] = (next_state[n, k + 1] - predicted[n, k + 1]) * per_error[k]
-        # asinh: they span five orders of magnitude, and must not drown the small ones in a network. A loop of its own, so that
-        # the compiler uses vector instructions
+        # asinh: innovations span five orders of magnitude, and large ones would hide small ones in a network. A separate loop,
+        # so that the compiler uses vector instructions
         for j in range(len(innovations)):
             innovations[j] = asinh_ratio(innovations[j], 1.0)
         for n in range(len(cells)):

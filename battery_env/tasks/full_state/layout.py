@@ -1,8 +1,7 @@
 """
-The layout of the full-state tasks: what actions stand for, how states become observations and costs, and the records that the
-kernels read and write.
+The layout of the full-state tasks: ranges of actions, scales of observations, costs, and the records of the kernels.
 
-The kernels take records (structured arrays): numba passes one with all its fields in less time than a single array more takes.
+The kernels take records (structured arrays): numba passes one record with all its fields faster than one more array.
 """
 
 from __future__ import annotations
@@ -22,33 +21,33 @@ Records = NDArray[np.void]
 OBSERVED = slice(VO, STATE_SIZE)
 OBSERVED_SIZE = STATE_SIZE - VO
 
-#: Error scales of Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V and C. A parameter that is off by 10 % puts Vo, Vsn and Vsp off by some
-#: tenths of them in one step.
+#: Error scales of Vo, Vsn, Vsp, qnB, qnS, qpB, qpS, V and C. An error of 10 % in a parameter changes Vo, Vsn and Vsp by some
+#: tenths of their scales in one step.
 ERROR_SCALE: FloatArray = np.array([0.01, 1e-5, 1e-5, 20.0, 20.0, 20.0, 20.0])
-#: The voltage by which each parameter is judged: a wrong one moves it in one step, and the model forgets the error in a minute
-#: (time constants of 46 and 6 s). Vsn keeps errors for a quarter of an hour, and charges keep them for ever: in their cost old
-#: errors hide what the last decision did.
-JUDGED_BY: Mapping[str, int] = {"q_mobile": VSP, "r_o": VO}
+#: The voltage in the cost of each parameter: a wrong parameter moves this voltage in one step, and the error decays in a
+#: minute (time constants of 46 and 6 s). Errors of Vsn last a quarter of an hour, and errors of charges last for ever: in a
+#: cost these old errors would hide the effect of the last decision.
+COST_STATES: Mapping[str, int] = {"q_mobile": VSP, "r_o": VO}
 
 
 @dataclass(frozen=True, eq=False)
 class Formulation:
     """
-    How states become observations and costs. The arrays have the order of the state without temperature: Vo, Vsn, Vsp, qnB,
-    qnS, qpB, qpS, in V and C.
+    Scales of observations, and the cost. The arrays have the order of the state without temperature: Vo, Vsn, Vsp, qnB, qnS,
+    qpB, qpS, in V and C.
 
-    :param action_ranges: the parameters at actions of -1 and 1, C and ohm. They reach beyond those of all cells, since charge
-        that errors have moved is taken back by errors of the other sign. In the authors' range no estimate is below the truth
-        of the oldest cells: their models drift off
+    :param action_ranges: the parameters at actions of -1 and 1, C and ohm. They reach beyond the parameters of all cells,
+        because the agent corrects errors of the charges by errors of the other sign. In the authors' range no estimate is
+        below the truth of the oldest cells, so that their models drift off
     :param state_scale: divisor of observed states, shape (7,)
     :param load_scale: divisor of observed loads, W
     :param innovations: whether the observation holds both innovations, asinh of x_{t+1} minus the prediction of a model with
         a new cell's parameters, in error scales: one from the model's state x̂_t, one from the measured state x_t
-    :param literal_cost: whether the cost is that of the authors: 0.5 times the norm of the errors of the voltages plus 0.5
-        times that of the charges, times 50 where this exceeds 1e-4. Otherwise it is the error of the voltage by which a
-        parameter is judged (:data:`JUDGED_BY`), added over the parameters that are to be found
-    :param cost_limit: largest cost of a parameter. Errors span four orders of magnitude near the end of a discharge. A critic
-        that is fitted to such costs does not see the small ones
+    :param literal_cost: whether the cost is the authors': 0.5 times the norm of the errors of the voltages plus 0.5 times the
+        norm of the errors of the charges, times 50 where this exceeds 1e-4. Otherwise the cost is the sum of the errors of the
+        voltages of the parameters to estimate (:data:`COST_STATES`)
+    :param cost_limit: largest cost of a parameter. Errors span four orders of magnitude near the end of a discharge, so that a
+        critic would not resolve small costs
     """
 
     action_ranges: Mapping[str, tuple[float, float]]
@@ -59,7 +58,7 @@ class Formulation:
     cost_limit: float
 
 
-#: States and loads over what they reach in a new cell under 8 to 16 W.
+#: Scales are the largest states and loads of a new cell under 8 to 16 W.
 SCALED = Formulation(
     action_ranges={"q_mobile": (3500.0, 8100.0), "r_o": (0.08, 0.22)},
     state_scale=np.array([0.5, 0.1, 0.01, 6840.0, 760.0, 11400.0, 1266.0]),
@@ -68,7 +67,7 @@ SCALED = Formulation(
     literal_cost=False,
     cost_limit=5.0,
 )
-#: The authors' code: states over a new cell's charges and 1 V, loads over 20 W.
+#: The authors' code: scales are a new cell's charges, 1 V and 20 W.
 LITERAL = Formulation(
     action_ranges={"q_mobile": (4000.0, 8000.0), "r_o": (0.08, 0.22)},
     state_scale=np.array([1.0, 1.0, 1.0, 6840.0, 760.0, 4560.0, 506.67]),
@@ -78,7 +77,7 @@ LITERAL = Formulation(
     cost_limit=1e4,
 )
 
-#: What the kernels know of a task, one record. Ranges and actions are those of (q_mobile, r_o), in this order.
+#: Settings of a task for the kernels, one record. Pairs have the order (q_mobile, r_o).
 SETTINGS = np.dtype(
     [
         ("dt_s", float),
@@ -88,12 +87,12 @@ SETTINGS = np.dtype(
         ("polynomial_n", float, (POLYNOMIAL_SIZE,)),
         ("polynomial_p", float, (POLYNOMIAL_SIZE,)),
         ("new_parameters", float, (2,)),
-        ("finds", np.int64, (2,)),  # 1 where a parameter is to be found
-        ("lowest", float, (2,)),  # what an action of -1 stands for
-        ("highest", float, (2,)),
+        ("is_sought", np.int64, (2,)),  # 1 for a parameter to estimate
+        ("lowest", float, (2,)),  # at an action of -1
+        ("highest", float, (2,)),  # at an action of 1
         ("literal_cost", bool),
         ("cost_limit", float),
-        ("judged_by", np.int64, (2,)),  # index of a voltage
+        ("cost_states", np.int64, (2,)),  # index of a voltage
         ("per_state", float, (OBSERVED_SIZE,)),
         ("per_load", float),
         ("per_error", float, (OBSERVED_SIZE,)),
@@ -109,8 +108,8 @@ CELL = np.dtype(
         ("last_sample", np.int64),  # of the discharge
         ("last_decision", np.int64),  # last sample at which there is a decision
         ("load_start", np.int64),  # index of the first load of the discharge
-        ("steps", np.int64),  # decisions of this episode, fewer where the data end
-        ("decisions", np.int64),  # number of those made
+        ("steps", np.int64),  # decisions of this episode, fewer if the data end earlier
+        ("decisions", np.int64),  # number of decisions so far
         ("state", float, (STATE_SIZE,)),  # x_t
         ("next_state", float, (STATE_SIZE,)),  # x_{t+1}
         ("model_state", float, (STATE_SIZE,)),  # of the model at t

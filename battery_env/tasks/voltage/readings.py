@@ -1,4 +1,4 @@
-"""What voltage and current of a discharge say about the parameters: the model's misfit to all readings so far."""
+"""Readings of voltage and current of a discharge, and the model's misfit to all readings so far."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ from battery_env.electrochemistry.cell import (
 from battery_env.electrochemistry.kernels import BLOCK, equilibrium_voltage, mole_fraction, nominal_overpotentials
 from battery_env.records import Record, check_record, resample_current
 
-# Far more charge than it takes to read the linear part of the model off one simulation
-_PLENTY_C = 1e6
+# A charge that no discharge empties: one simulation then gives the linear part of the model
+_LARGE_CHARGE_C = 1e6
 # Share of q_mobile in the surface of each electrode at full charge
 _SURFACE_SHARE_N, _SURFACE_SHARE_P = (float(FULL_CHARGE_SHARES[column - QNB]) for column in (QNS, QPS))
 #: Step of the difference quotient dV/dq, as a share of q.
 RELATIVE_STEP = 1e-3
-# A current this much above a mean is equal to it but for rounding, A
+# A current is above a mean only by more than this, A: less is rounding
 _EQUAL_A = 1e-9
 
-# Readings are compared in blocks: one array, in rows that start at multiples that the compiler knows. It uses vector
-# instructions where it sees that rows do not overlap, and where no reading waits for the one before
+# The kernels compare readings in blocks: one array, in rows that start at constant multiples. The compiler uses vector
+# instructions where it can tell that rows do not overlap, and where a reading does not depend on the previous reading
 MEASURED, CURRENT, MOVED, OHMIC, STEPS, HALF, VSN, VSP, FURTHER_VSN, FURTHER_VSP, MODELLED, RESIDUAL, SLOPE = range(13)
 BLOCK_SIZE = 13 * BLOCK
-#: The first rows are what sensors show of a discharge: voltage, V, mean current since the reading before, A, charge that has
-#: left the surface of the negative electrode, C, ohmic drop per ohm, A, and steps of the model since the reading before.
+#: The first rows are measurements: voltage, V, mean current since the previous reading, A, charge that has left the surface of
+#: the negative electrode, C, ohmic drop per ohm, A, and steps of the model since the previous reading.
 SENSOR_ROWS = 5
-# the most numbers that an instruction takes at once (AVX-512)
+# largest number of values of one instruction (AVX-512)
 _LANES = 8
 
-#: What the kernels know of the model, one record.
+#: The model for the kernels, one record.
 MODEL = np.dtype(
     [
         ("constants", float, (1, CONSTANTS_SIZE)),
@@ -67,27 +67,27 @@ MODEL = np.dtype(
 @dataclass(frozen=True, eq=False)
 class Readings:
     """
-    Discharges that start fully charged, read at their samples, with what the model's linear part makes of their current.
+    Discharges from full charge, read at their samples, with the linear part of the model under their current.
 
-    At a given history of the current the charges of the model are linear in ``q_mobile`` and its ohmic drop is linear in
-    ``r_o``; so both follow for every (q_mobile, r_o) from two numbers a reading. Only the surface overpotentials must be
-    integrated anew, which takes one step a reading (:func:`explain`). All discharges lie end to end.
+    At a fixed current the charges of the model are linear in ``q_mobile``, and its ohmic drop is linear in ``r_o``; so two
+    numbers a reading give both for every (q_mobile, r_o). Only the surface overpotentials need a new integration, one step a
+    reading (:func:`summarise_residuals`). The arrays of all discharges are concatenated.
     """
 
-    start: IntArray  # where each discharge starts, shape (n,)
+    start: IntArray  # first reading of each discharge, shape (n,)
     start_s: FloatArray  # time of its first sample, s, shape (n,)
-    count: IntArray  # how many readings it has, shape (n,)
-    sample: IntArray  # which sample of its discharge each reading is, shape (total,), as all that follow
+    count: IntArray  # number of its readings, shape (n,)
+    sample: IntArray  # sample of each reading in its discharge, shape (total,), as all arrays down to ``ohmic_A``
     time_s: FloatArray  # of the readings since the first sample, s
     voltage_V: FloatArray  # terminal voltage
-    current_A: FloatArray  # mean since the reading before
+    current_A: FloatArray  # mean since the previous reading
     drawn_C: FloatArray  # charge drawn since the start
-    moved_C: FloatArray  # how much of it has left the surface of the negative electrode
+    moved_C: FloatArray  # charge that has left the surface of the negative electrode
     ohmic_A: FloatArray  # ohmic drop per ohm of ``r_o``
-    q_mobile: FloatArray  # true value, C, NaN where it is not known, shape (n,)
-    r_o: FloatArray  # true value, ohm, NaN where it is not known, shape (n,)
+    q_mobile: FloatArray  # true value, C, NaN if unknown, shape (n,)
+    r_o: FloatArray  # true value, ohm, NaN if unknown, shape (n,)
     interval_s: float  # least time between readings, s
-    dt_s: float  # step at which the current was followed, s; readings are taken to lie at whole numbers of them
+    dt_s: float  # time step of the model, s; all readings are at multiples of it
     cell: CellParameters  # constants of the model
 
     @classmethod
@@ -99,14 +99,13 @@ class Readings:
         cell: CellParameters = NEW_CELL,
     ) -> Readings:
         """
-        Read discharges at their samples, or at some of them, so that readings lie ``interval_s`` apart at least, a whole
-        number of steps; or, of (least, most), at intervals of half a mean time to half as long again, as testers write them,
-        with a mean that is drawn for each discharge. A record may say with ``measured`` which of its samples have a voltage,
-        shape (K,).
+        Read discharges at samples at least ``interval_s`` apart, a whole number of steps. With (least, most) each discharge
+        draws a mean interval, and each interval is 0.5 to 1.5 times the mean, as testers write them. If a record has
+        ``is_measured``, shape (K,), only these samples have a voltage.
         """
         low_s, high_s = interval_s if isinstance(interval_s, Sequence) else (interval_s, interval_s)
-        least = round(low_s / dt_s)
-        if least < 1 or abs(least * dt_s - low_s) > 1e-9 * low_s:
+        least_steps = round(low_s / dt_s)
+        if least_steps < 1 or abs(least_steps * dt_s - low_s) > 1e-9 * low_s:
             raise ValueError(f"interval_s must be a multiple of the time step, {dt_s:g} s, got {low_s!r}")
         if not low_s <= high_s < np.inf:
             raise ValueError(f"interval_s must be (least, most) with least <= most, got {interval_s!r}")
@@ -115,18 +114,18 @@ class Readings:
         for n, record in enumerate(records):
             samples = check_record(record, least_samples=2)
             time_s = samples.time_s - samples.time_s[0]
-            wanted = np.full(len(time_s), float(least))
+            intervals = np.full(len(time_s), float(least_steps))
             if high_s > low_s:
-                wanted = np.exp(rng.uniform(np.log(low_s), np.log(high_s))) / dt_s * rng.uniform(0.5, 1.5, len(time_s))
-            candidates = np.flatnonzero(getattr(record, "measured", np.ones(len(time_s), dtype=np.bool_)))
-            chosen = candidates[_apart(np.rint(time_s[candidates] / dt_s), wanted)]
-            if len(chosen) < 2:
+                intervals = np.exp(rng.uniform(np.log(low_s), np.log(high_s))) / dt_s * rng.uniform(0.5, 1.5, len(time_s))
+            candidates = np.flatnonzero(getattr(record, "is_measured", np.ones(len(time_s), dtype=np.bool_)))
+            rows = candidates[_thin(np.rint(time_s[candidates] / dt_s), intervals)]
+            if len(rows) < 2:
                 raise ValueError(f"discharge {n} lasts {time_s[-1]:g} s, at least two readings {low_s:g} s apart are needed")
-            steps = np.rint(time_s[chosen] / dt_s).astype(np.int64)
+            steps = np.rint(time_s[rows] / dt_s).astype(np.int64)
             current_A = resample_current(time_s, samples.current_A, dt_s, int(steps[-1]))
             drawn_C, moved_C, ohmic_A = _linear_part(current_A, steps, dt_s, cell)
             mean_A = np.diff(drawn_C, prepend=0.0) / (dt_s * np.diff(steps, prepend=0))
-            columns.append((chosen, dt_s * steps, samples.voltage_V[chosen], mean_A, drawn_C, moved_C, ohmic_A))
+            columns.append((rows, dt_s * steps, samples.voltage_V[rows], mean_A, drawn_C, moved_C, ohmic_A))
         if not columns:
             raise ValueError("there must be at least one discharge to read")
         counts = np.array([len(column[0]) for column in columns], dtype=np.int64)
@@ -152,75 +151,74 @@ class Readings:
     def __len__(self) -> int:
         return len(self.count)
 
-    def part(self, discharge: int) -> slice:
-        """Where the readings of one discharge lie."""
+    def rows_of(self, discharge: int) -> slice:
+        """Return the rows of the readings of one discharge."""
         return slice(int(self.start[discharge]), int(self.start[discharge] + self.count[discharge]))
 
-    def shown(self, discharge: int) -> FloatArray:
-        """What exact sensors show of one discharge, shape (SENSOR_ROWS, readings)."""
-        return self._all_shown[:, self.part(discharge)]
+    def exact_measurements(self, discharge: int) -> FloatArray:
+        """Return the measurements of exact sensors of one discharge, shape (SENSOR_ROWS, readings)."""
+        return self._all_measurements[:, self.rows_of(discharge)]
 
     @cached_property
-    def _all_shown(self) -> FloatArray:
+    def _all_measurements(self) -> FloatArray:
         return np.stack([self.voltage_V, self.current_A, self.moved_C, self.ohmic_A, self._steps])
 
     @cached_property
     def _steps(self) -> FloatArray:
-        """Steps of the model since the reading before."""
+        """Steps of the model since the previous reading."""
         steps = np.diff(self.time_s, prepend=0.0)
         steps[self.start] = self.time_s[self.start]
         return np.rint(steps / self.dt_s)
 
     @cached_property
     def model(self) -> NDArray[np.void]:
-        """What the kernels know of the model, shape (1,)."""
+        """The record of the model for the kernels, shape (1,)."""
         model, cell = np.zeros(1, dtype=MODEL), self.cell
         for name, value in {**cell.packed._asdict(), "dt_s": self.dt_s}.items():
             model[name] = value
         return model
 
     def process_noise_V(self, discharge: int, deviation: float, draws: FloatArray) -> FloatArray:
-        """What white noise on Vo, Vsn and Vsp of a cell adds to its voltage at the readings of one discharge."""
+        """Return the noise of the voltage, at the readings of one discharge, from white noise on Vo, Vsn and Vsp."""
         cell, dt_s = self.cell, self.dt_s
         total = np.zeros(draws.shape[1])
         for draw, time_constant_s in zip(draws, (cell.to, cell.tsn, cell.tsp), strict=True):
-            # what is left after each interval of a quantity that decays
-            left = (1.0 - dt_s / time_constant_s) ** self._steps[self.part(discharge)]
-            # the variance of a sum of steps that decay on the way, over one interval
-            variance = dt_s * (1.0 - left**2) / (1.0 - (1.0 - dt_s / time_constant_s) ** 2)
-            total -= _filtered(deviation * np.sqrt(variance) * draw, left)
+            decay = (1.0 - dt_s / time_constant_s) ** self._steps[self.rows_of(discharge)]
+            # the variance of a sum of decaying steps over one interval
+            variance = dt_s * (1.0 - decay**2) / (1.0 - (1.0 - dt_s / time_constant_s) ** 2)
+            total -= _decaying_sum(deviation * np.sqrt(variance) * draw, decay)
         return total
 
-    def remeasured(self, discharge: int, gain: float, offset_A: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What another current sensor makes of one discharge: all is linear in the current."""
-        part = self.part(discharge)
-        steps = np.rint(self.time_s[part] / self.dt_s).astype(np.int64)
+    def with_sensor(self, discharge: int, gain: float, offset_A: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the current rows of another current sensor in one discharge; all of them are linear in the current."""
+        rows = self.rows_of(discharge)
+        steps = np.rint(self.time_s[rows] / self.dt_s).astype(np.int64)
         _, moved_by_unit, ohmic_by_unit = _linear_part(np.ones(int(steps[-1])), steps, self.dt_s, self.cell)
         return (
-            gain * self.current_A[part] + offset_A,
-            gain * self.moved_C[part] + offset_A * moved_by_unit,
-            gain * self.ohmic_A[part] + offset_A * ohmic_by_unit,
+            gain * self.current_A[rows] + offset_A,
+            gain * self.moved_C[rows] + offset_A * moved_by_unit,
+            gain * self.ohmic_A[rows] + offset_A * ohmic_by_unit,
         )
 
 
 @compiled
-def _apart(steps: FloatArray, wanted: FloatArray) -> IntArray:
-    # which samples lie at least so far apart, and the first of them so long after the start
-    chosen, last = np.empty(len(steps), np.int64), 0.0
+def _thin(steps: FloatArray, intervals: FloatArray) -> IntArray:
+    # samples at least these intervals apart, and the first interval after the start
+    rows, last = np.empty(len(steps), np.int64), 0.0
     count = 0
     for k in range(len(steps)):
-        if steps[k] - last >= wanted[count]:
-            chosen[count], last = k, steps[k]
+        if steps[k] - last >= intervals[count]:
+            rows[count], last = k, steps[k]
             count += 1
-    return chosen[:count]
+    return rows[:count]
 
 
 @compiled
-def _filtered(added: FloatArray, left: FloatArray) -> FloatArray:
-    # a quantity that decays, to which each interval adds something
-    values, value = np.empty(len(added)), 0.0
-    for k in range(len(added)):
-        value = left[k] * value + added[k]
+def _decaying_sum(increments: FloatArray, decay: FloatArray) -> FloatArray:
+    # a quantity that decays over each interval, plus the increments of the intervals
+    values, value = np.empty(len(increments)), 0.0
+    for k in range(len(increments)):
+        value = decay[k] * value + increments[k]
         values[k] = value
     return values
 
@@ -228,11 +226,11 @@ def _filtered(added: FloatArray, left: FloatArray) -> FloatArray:
 def _linear_part(
     current_A: FloatArray, steps: IntArray, dt_s: float, cell: CellParameters
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    start = initial_state(_PLENTY_C, cell)
+    start = initial_state(_LARGE_CHARGE_C, cell)
     state = simulate(
         np.append(current_A, 0.0),
-        _PLENTY_C,
-        1.0,  # ohm, so that the ohmic drop is the current that it follows
+        _LARGE_CHARGE_C,
+        1.0,  # ohm, so that the ohmic drop is in A
         dt=dt_s,
         load_unit="current",
         cell=cell,
@@ -252,10 +250,10 @@ def _linear_part(
 class Overpotentials(NamedTuple):
     """Surface overpotentials at a reading, V."""
 
-    vsn: float  # of the negative electrode
-    vsp: float  # of the positive electrode
-    further_vsn: float  # of the negative electrode at q (1 + ``RELATIVE_STEP``)
-    further_vsp: float  # likewise of the positive one
+    vsn: float  # negative electrode
+    vsp: float  # positive electrode
+    further_vsn: float  # negative electrode at q (1 + ``RELATIVE_STEP``)
+    further_vsp: float  # positive electrode at q (1 + ``RELATIVE_STEP``)
 
 
 #: Before the first reading.
@@ -263,16 +261,16 @@ AT_REST = Overpotentials(0.0, 0.0, 0.0, 0.0)
 
 
 @inlined
-def take_readings(block: FloatArray, shown: FloatArray, n: int, first: int, size: int) -> None:
+def load_readings(block: FloatArray, measurements: FloatArray, n: int, first: int, size: int) -> None:
     for row in range(SENSOR_ROWS):
         for k in range(size):
-            block[row * BLOCK + k] = shown[row, n, first + k]
+            block[row * BLOCK + k] = measurements[row, n, first + k]
 
 
 @inlined
 def pad_block(block: FloatArray, size: int, moved_before: float) -> int:
-    # Repeat the last reading up to the length that is returned, which vector instructions divide without a rest. The
-    # overpotentials relax towards their value half way between two readings
+    # Repeat the last reading up to a multiple of the vector length, and return this length. The overpotentials relax towards
+    # their value half way between two readings
     padded = (size + _LANES - 1) // _LANES * _LANES
     for row in range(SENSOR_ROWS):
         for k in range(size, padded):
@@ -303,18 +301,18 @@ def nominal_overpotentials_of_block(block: FloatArray, size: int, q: float, cons
 
 
 @inlined
-def relax_block(block: FloatArray, size: int, share_n: float, share_p: float, before: Overpotentials) -> Overpotentials:
-    # From the values that overpotentials tend to, a share of the way with each step, to those that they have; returns the last
-    vsn, vsp, further_vsn, further_vsp = before
-    steps, relaxed_n, relaxed_p = 0.0, 0.0, 0.0
+def relax_block(block: FloatArray, size: int, share_n: float, share_p: float, previous: Overpotentials) -> Overpotentials:
+    # Replace the steady states of the overpotentials by the relaxed overpotentials; return the last ones
+    vsn, vsp, further_vsn, further_vsp = previous
+    steps, relaxation_n, relaxation_p = 0.0, 0.0, 0.0
     for k in range(size):
         if block[STEPS * BLOCK + k] != steps:
             steps = block[STEPS * BLOCK + k]
-            relaxed_n, relaxed_p = 1.0 - (1.0 - share_n) ** steps, 1.0 - (1.0 - share_p) ** steps
-        vsn += relaxed_n * (block[VSN * BLOCK + k] - vsn)
-        vsp += relaxed_p * (block[VSP * BLOCK + k] - vsp)
-        further_vsn += relaxed_n * (block[FURTHER_VSN * BLOCK + k] - further_vsn)
-        further_vsp += relaxed_p * (block[FURTHER_VSP * BLOCK + k] - further_vsp)
+            relaxation_n, relaxation_p = 1.0 - (1.0 - share_n) ** steps, 1.0 - (1.0 - share_p) ** steps
+        vsn += relaxation_n * (block[VSN * BLOCK + k] - vsn)
+        vsp += relaxation_p * (block[VSP * BLOCK + k] - vsp)
+        further_vsn += relaxation_n * (block[FURTHER_VSN * BLOCK + k] - further_vsn)
+        further_vsp += relaxation_p * (block[FURTHER_VSP * BLOCK + k] - further_vsp)
         block[VSN * BLOCK + k], block[VSP * BLOCK + k] = vsn, vsp
         block[FURTHER_VSN * BLOCK + k], block[FURTHER_VSP * BLOCK + k] = further_vsn, further_vsp
     return Overpotentials(vsn, vsp, further_vsn, further_vsp)
@@ -348,24 +346,24 @@ def voltages_of_block(
 def _mean_of_halves(
     residual: FloatArray, slope: FloatArray, ohmic: FloatArray, low: int, high: int, means: FloatArray
 ) -> None:
-    # The means of a stretch over the readings with less and with more current than its mean, into means of shape (3, 2)
+    # Write the means over the readings below and above the mean current of a stretch into means, shape (3, 2)
     middle_A = 0.0
     for k in range(low, high):
         middle_A += ohmic[k]
     middle_A = middle_A / (high - low) + _EQUAL_A
-    # a sum of zeros costs less than a branch that nobody foresees
+    # adding zeros costs less than a branch that the processor cannot predict
     residual_0 = residual_1 = slope_0 = slope_1 = ohmic_0 = ohmic_1 = 0.0
     count_1 = 0
     for k in range(low, high):
         r, s, o = residual[k], slope[k], ohmic[k]
-        more = o > middle_A
-        residual_0 += 0.0 if more else r
-        residual_1 += r if more else 0.0
-        slope_0 += 0.0 if more else s
-        slope_1 += s if more else 0.0
-        ohmic_0 += 0.0 if more else o
-        ohmic_1 += o if more else 0.0
-        count_1 += 1 if more else 0
+        is_above = o > middle_A
+        residual_0 += 0.0 if is_above else r
+        residual_1 += r if is_above else 0.0
+        slope_0 += 0.0 if is_above else s
+        slope_1 += s if is_above else 0.0
+        ohmic_0 += 0.0 if is_above else o
+        ohmic_1 += o if is_above else 0.0
+        count_1 += 1 if is_above else 0
     count_0 = high - low - count_1
     if count_1 == 0:
         # under a constant current there is one half only
@@ -376,11 +374,11 @@ def _mean_of_halves(
 
 
 @compiled
-def explain(
+def summarise_residuals(
     rows: IntArray,
     count: IntArray,
     estimate: FloatArray,
-    shown: FloatArray,
+    measurements: FloatArray,
     model: NDArray[np.void],
     means: FloatArray,
     rms_V: FloatArray,
@@ -389,27 +387,27 @@ def explain(
     """
     Compare the model with the first readings of many cells; unchecked, all arrays contiguous.
 
-    :param rows: which of the n cells
-    :param count: how many readings of each cell there are, shape (n,)
+    :param rows: indices of the cells, of n cells
+    :param count: number of readings of each cell, shape (n,)
     :param estimate: q_mobile and r_o, shape (n, 2)
-    :param shown: as of :meth:`Readings.shown`, shape (SENSOR_ROWS, n, most readings)
+    :param measurements: as of :meth:`Readings.exact_measurements`, shape (SENSOR_ROWS, n, most readings)
     :param means: overwritten: of the residual, dV/dq and the ohmic drop per ohm over the readings with less and with more
         current in equal stretches, shape (3, n, stretches, 2)
     :param rms_V: overwritten: root mean square of the residuals, shape (n,)
     :param last_V: overwritten: modelled voltage at the last reading, shape (n,)
     """
     stretches, block = means.shape[2], np.empty(BLOCK_SIZE)
-    # of all readings of one cell: measured minus modelled voltage, and dV/dq
-    residual, slope = np.empty((2, shown.shape[2]))
+    # measured minus modelled voltage, and dV/dq, of all readings of one cell
+    residual, slope = np.empty((2, measurements.shape[2]))
     cell = model[0]
     constants = cell.constants
     share_n, share_p = cell.dt_s * constants[0, TSN_RATE], cell.dt_s * constants[0, TSP_RATE]
     for n in rows:
-        end, q, r = count[n], estimate[n, 0], estimate[n, 1]
+        readings, q, r = count[n], estimate[n, 0], estimate[n, 1]
         moved_before, overpotentials = 0.0, AT_REST
-        for low in range(0, end, BLOCK):
-            size = min(BLOCK, end - low)
-            take_readings(block, shown, n, low, size)
+        for low in range(0, readings, BLOCK):
+            size = min(BLOCK, readings - low)
+            load_readings(block, measurements, n, low, size)
             padded = pad_block(block, size, moved_before)
             moved_before = block[MOVED * BLOCK + size - 1]
             nominal_overpotentials_of_block(block, padded, q, constants)
@@ -420,10 +418,10 @@ def explain(
                 slope[low + k] = block[SLOPE * BLOCK + k]
             last_V[n] = block[MODELLED * BLOCK + size - 1]
         square = 0.0
-        for k in range(end):
+        for k in range(readings):
             square += residual[k] ** 2
-        rms_V[n] = np.sqrt(square / end)
+        rms_V[n] = np.sqrt(square / readings)
         for j in range(stretches):
-            low = j * end // stretches
-            high = max(low + 1, (j + 1) * end // stretches)
-            _mean_of_halves(residual, slope, shown[OHMIC, n], low, high, means[:, n, j])
+            low = j * readings // stretches
+            high = max(low + 1, (j + 1) * readings // stretches)
+            _mean_of_halves(residual, slope, measurements[OHMIC, n], low, high, means[:, n, j])
