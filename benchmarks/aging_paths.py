@@ -131,7 +131,7 @@ def path_of(cells: Sequence[str], folder: Path) -> tuple[AgingPath, Path]:
 
 
 def run_of(algo: str, cells: Sequence[str], seed: int, folder: Path) -> Run:
-    """How a policy learns along the path of some lives."""
+    """Training of a policy along the path of some lives."""
     path, file = path_of(cells, folder)
     data = file.with_name(file.name.replace("path_", "cells_")).with_suffix(".npz")
     if not data.exists():
@@ -205,7 +205,7 @@ class _Whole:
 def _row(
     path: AgingPath, whole: _Whole, share: float, record: Discharge, found: Estimate, mismatch_V: float | None = None
 ) -> dict[str, object]:
-    """What an estimate along a path is worth, in per cent of ``q_mobile``, and its end."""
+    """Errors of an estimate along a path, in per cent of ``q_mobile``, and of its end."""
     row: dict[str, object] = {"share": share, "settled": found.settled_q_mobile}
     row |= {"q_error_percent": 100.0 * (found.q_mobile / whole.q_mobile - 1.0)}
     if share == 1.0:
@@ -225,7 +225,7 @@ def _end(whole: _Whole, quantiles_s: Sequence[float] | FloatArray) -> dict[str, 
 def _said(
     path: AgingPath, life: str, labelled: Sequence[Discharge], whole: _Whole, last: Discharge
 ) -> Iterator[dict[str, object]]:
-    """What each method says of a discharge at each share of its time."""
+    """Rows of each method on a discharge at each share of its time."""
     yield from _along(path, PATH.format(life), whole)
     for share in SHARES[:-1]:
         seen = whole.seen(share)
@@ -239,7 +239,7 @@ def _said(
 
 
 def _along(path: AgingPath, method: str, whole: _Whole) -> Iterator[dict[str, object]]:
-    """What least squares say of a discharge along a path."""
+    """Rows of least squares on a discharge along a path."""
     for share in SHARES:
         record = whole.seen(share).loaded_part(CUT_OFF_V)
         yield {"method": method, **_row(path, whole, share, record, LeastSquares(path=path).estimate(record))}
@@ -271,7 +271,7 @@ def _with_own_life(method: str, settings: Settings, before: Life, whole: _Whole)
 
 
 def _regression(labelled: Sequence[Discharge], whole: _Whole, record: Discharge) -> float:
-    """How far the end is off that a linear map of the voltages tells, learned on capacities that were measured, per cent."""
+    """Error of the end by a linear map of the voltages, learned on measured capacities, in per cent."""
     charge_C = record.charge_C
     loaded = [each.loaded_part(CUT_OFF_V) for each in labelled]
     usable = [each for each in loaded if each.charge_C > charge_C]
@@ -287,7 +287,7 @@ def _regression(labelled: Sequence[Discharge], whole: _Whole, record: Discharge)
 
 
 def _steps_V(record: Discharge, charge_C: float) -> FloatArray:
-    """How far the voltage falls over equal steps of charge, up to one."""
+    """Falls of the voltage over equal steps of charge, up to one."""
     drawn_C = integrate_load(record.time_s, record.current_A, record.time_s)
     at_C = charge_C * (np.arange(_STEPS + 1) + 0.5) / (_STEPS + 1)
     return np.diff(np.interp(at_C, drawn_C - drawn_C[0], record.voltage_V))

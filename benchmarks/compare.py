@@ -57,14 +57,14 @@ from sb3_lac.cost_algorithm import CostAlgorithm
 def part(algo: str, source: str, run: dict[str, Any], out: Path, evaluations: int) -> Tables:
     """Train one policy, unless that has been done, and score it; ``algo`` and ``source`` are for the table."""
     made_from = Run(**run)
-    folder, of_env = _folder(made_from, out), contest_of(made_from.task)
+    folder, contest = _folder(made_from, out), contest_of(made_from.task)
     every = max(made_from.timesteps // (evaluations * made_from.n_envs), 1)
     curve = folder / f"learning_{made_from.name}.csv"
     if not checkpoint_file(made_from, folder).exists() and not record_file(made_from, folder).exists():
         curve.unlink(missing_ok=True)  # what began and left no checkpoint left no curve
 
     def new_env() -> VecEnv:
-        env = made_from.environments(1, **of_env.options)
+        env = made_from.environments(1, **contest.options)
         env.seed(made_from.seed)
         return env
 
@@ -72,7 +72,7 @@ def part(algo: str, source: str, run: dict[str, Any], out: Path, evaluations: in
     about = {"env": made_from.task, "recipe": made_from.digest, "timesteps": made_from.timesteps, "source": source}
     callbacks: list[BaseCallback] = [
         CalibrationCallback(
-            lambda candidate: of_env.scores(candidate, env, brief=True), every, of_env.metrics, curve, verbose=0
+            lambda candidate: contest.scores(candidate, env, brief=True), every, contest.metrics, curve, verbose=0
         ),
         EvalCallback(new_env(), n_eval_episodes=EVALUATION_EPISODES, eval_freq=every, verbose=0),
         DashboardCallback(CALIBRATION_CHARTS, {**run["settings"], **about}),
@@ -82,8 +82,8 @@ def part(algo: str, source: str, run: dict[str, Any], out: Path, evaluations: in
         seed = made_from.seed + made_from.n_envs
         callbacks.append(LyapunovCallback(new_env(), None, EVALUATION_EPISODES, every, seed, verbose=0))
     log = f"{made_from.algorithm.replace(' ', '_')}_seed{made_from.seed}_{made_from.digest}"
-    model = train_or_load(made_from, folder, callbacks=callbacks, log=out / "tensorboard" / of_env.env_id / log)
-    return {"scores": of_env.scores(model, env), "learning": pd.read_csv(curve)}
+    model = train_or_load(made_from, folder, callbacks=callbacks, log=out / "tensorboard" / contest.env_id / log)
+    return {"scores": contest.scores(model, env), "learning": pd.read_csv(curve)}
 
 
 def _folder(run: Run, out: Path) -> Path:
@@ -91,7 +91,7 @@ def _folder(run: Run, out: Path) -> Path:
 
 
 def finished_runs(study: Study) -> pd.DataFrame:
-    """What the finished runs in a folder say, one row per run, with its tables."""
+    """Collect the finished runs of a folder, one row per run, with its tables."""
     rows = []
     for arguments, tables in study.done(part):
         run = Run(**arguments["run"])
@@ -128,23 +128,23 @@ def report(study: Study) -> None:
     runs = finished_runs(study)
     if runs.empty:
         return
-    shown: dict[tuple[str, ...], list[pd.DataFrame]] = {}  # a table for readers for each set of columns
+    tables_by_columns: dict[tuple[str, ...], list[pd.DataFrame]] = {}  # a table for readers for each set of columns
     tables = []
-    for _, of_env in runs.groupby("env"):
-        for_readers, table = contest_of(of_env["made_by"].iloc[0]["run"]["task"]).report(of_env, study)
+    for _, env_runs in runs.groupby("env"):
+        for_readers, table = contest_of(env_runs["made_by"].iloc[0]["run"]["task"]).report(env_runs, study)
         tables.append(table)
-        shown.setdefault(tuple(for_readers.columns), []).append(for_readers)
-    together = pd.concat(tables, ignore_index=True)
-    if len(together) > 0:
-        study.write_table("compare", together, recipes_of(runs))
-    texts = [markdown(pd.concat(of_columns)) for of_columns in shown.values()]
+        tables_by_columns.setdefault(tuple(for_readers.columns), []).append(for_readers)
+    summary = pd.concat(tables, ignore_index=True)
+    if len(summary) > 0:
+        study.write_table("compare", summary, recipes_of(runs))
+    texts = [markdown(pd.concat(of_columns)) for of_columns in tables_by_columns.values()]
     resumed = runs[runs["resumed"] > 0]
     if len(resumed) > 0:
-        said = "Interrupted and continued from a checkpoint, with other random numbers than an uninterrupted run has:\n\n"
+        text = "Interrupted and continued from a checkpoint, with other random numbers than an uninterrupted run has:\n\n"
         for _, of_run in resumed.iterrows():
             times = "once" if of_run["resumed"] == 1 else f"{of_run['resumed']} times"
-            said += f"- {of_run['label']} on {of_run['env']}, seed {of_run['seed']}: {times}\n"
-        texts.append(said)
+            text += f"- {of_run['label']} on {of_run['env']}, seed {of_run['seed']}: {times}\n"
+        texts.append(text)
     study.write({}, {}, "\n".join(texts))
 
 
@@ -205,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--evaluations", type=positive, default=10, help="evaluations during each run")
     study = Study(parser, arguments)
     chosen = study.chosen
-    given = {"timesteps": chosen.timesteps, "defaults": chosen.defaults}
+    options = {"timesteps": chosen.timesteps, "defaults": chosen.defaults}
     source = "defaults" if chosen.defaults else "zoo_configs"
     try:
         differing = _differing(chosen.hyperparams)
@@ -217,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for algo, env_id in itertools.product(chosen.algos, chosen.envs)
         }
         runs = [
-            (algo, zoo_run(algo, env_id, seed, differing=differ[algo, env_id], **given))
+            (algo, zoo_run(algo, env_id, seed, differing=differ[algo, env_id], **options))
             for env_id, seed, algo in itertools.product(chosen.envs, chosen.seeds, chosen.algos)
         ]
         for run in {run.digest: run for _, run in runs}.values():

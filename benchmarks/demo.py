@@ -39,7 +39,7 @@ EVALUATIONS, EVERY, EVERY_IN_THE_END = 5, 40, 8
 
 
 class Learned(NamedTuple):
-    """What one algorithm reached: its errors while it learned, and on each discharge in the end."""
+    """Errors of one algorithm: while it learned, and on each discharge in the end."""
 
     curve: pd.DataFrame
     scores: pd.DataFrame
@@ -64,13 +64,13 @@ def learned(algo: str) -> Learned:
 def compared(out: Path) -> str:
     """Train the algorithms side by side, draw what they reached, and say it."""
     with workers(len(ALGORITHMS)) as executor:
-        found = dict(zip(map(str.upper, ALGORITHMS), executor.map(importable(learned), ALGORITHMS), strict=True))
-    scores = {algo: each.scores for algo, each in found.items()}
+        results = dict(zip(map(str.upper, ALGORITHMS), executor.map(importable(learned), ALGORITHMS), strict=True))
+    scores = {algo: each.scores for algo, each in results.items()}
     save_figure(plot_true_against_inferred(scores, PARAMETER), out / f"{ENV}_inferred.png")
-    save_figure(plot_learning_curves({algo: [each.curve] for algo, each in found.items()}, ENV), out / f"{ENV}_learning.png")
+    save_figure(plot_learning_curves({algo: [each.curve] for algo, each in results.items()}, ENV), out / f"{ENV}_learning.png")
     errors = {algo: each[f"{PARAMETER}_mape_percent"] for algo, each in scores.items()}
-    said = ", ".join(f"{algo} {error.mean():.2g} % ({error.max():.2g} %)" for algo, error in errors.items())
-    return f"R_o of held-out simulated cells, mean error (worst discharge): {said}"
+    summary = ", ".join(f"{algo} {error.mean():.2g} % ({error.max():.2g} %)" for algo, error in errors.items())
+    return f"R_o of held-out simulated cells, mean error (worst discharge): {summary}"
 
 
 @contextmanager

@@ -191,23 +191,25 @@ class DirectMapping(Estimator):
     def infer(self, pairs: Pairs) -> FloatArray:
         """The parameter of each pair."""
         with th.no_grad():
-            told = [self.network(chunk) for chunk in self._inputs.to_tensor(_inputs(pairs)).split(_CHUNK)]
-        scaled = th.cat(told).numpy().astype(np.float64)
+            inferred = [self.network(chunk) for chunk in self._inputs.to_tensor(_inputs(pairs)).split(_CHUNK)]
+        scaled = th.cat(inferred).numpy().astype(np.float64)
         return (self._labels.mean + self._labels.spread * scaled)[:, 0]
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]
         """One estimate for every step of many discharges."""
-        whole = list(records)
+        discharges = list(records)
         pairs = Pairs(
-            np.concatenate([record.state[:-1, OBSERVED] for record in whole]),
-            np.concatenate([record.state[1:, OBSERVED] for record in whole]),
-            np.concatenate([record.load[:-1] for record in whole]),
+            np.concatenate([record.state[:-1, OBSERVED] for record in discharges]),
+            np.concatenate([record.state[1:, OBSERVED] for record in discharges]),
+            np.concatenate([record.load[:-1] for record in discharges]),
             np.empty(0),
         )
-        ends = np.cumsum([len(record.time_s) - 1 for record in whole])[:-1]
+        ends = np.cumsum([len(record.time_s) - 1 for record in discharges])[:-1]
         traces = []
-        for record, told in zip(whole, np.split(self.infer(pairs), ends), strict=True):
-            values = {name: np.full(len(told), getattr(record, name)) for name in PARAMETER_NAMES} | {self.parameter: told}
+        for record, inferred in zip(discharges, np.split(self.infer(pairs), ends), strict=True):
+            values = {name: np.full(len(inferred), getattr(record, name)) for name in PARAMETER_NAMES} | {
+                self.parameter: inferred
+            }
             traces.append(EstimateTrace(record.time_s[1:], values["q_mobile"], values["r_o"]))
         return traces
 
@@ -220,7 +222,7 @@ class DirectMapping(Estimator):
 def scores(estimator: Estimator, parameter: Parameter, division: str, method: str, seed: int | None) -> Tables:
     """Score a calibrator on the test part of a division."""
     test = divided(parameter, division)[1]
-    found = evaluate(estimator, test.subset(range(0, len(test), max(len(test) // TEST_DISCHARGES, 1))))
+    scores_of_test = evaluate(estimator, test.subset(range(0, len(test), max(len(test) // TEST_DISCHARGES, 1))))
     columns = {
         "load_W": "load",
         "true": parameter,
@@ -232,7 +234,7 @@ def scores(estimator: Estimator, parameter: Parameter, division: str, method: st
         "spread": f"{parameter}_spread",
         "time_per_estimate_s": "time_per_update_s",
     }
-    table = pd.DataFrame({name: found[column] for name, column in columns.items()})
+    table = pd.DataFrame({name: scores_of_test[column] for name, column in columns.items()})
     for name, value in (("seed", seed), ("division", division), ("parameter", parameter), ("method", method)):
         table.insert(0, name, value)
     return {"direct_mapping": table}
@@ -241,8 +243,8 @@ def scores(estimator: Estimator, parameter: Parameter, division: str, method: st
 def mapping_part(kind: str, parameter: Parameter, division: str, seed: int, pairs: int, epochs: int) -> Tables:
     """Teach one direct mapping, and score it."""
     th.set_num_threads(1)
-    drawn = draw_pairs(divided(parameter, division)[0], parameter, pairs, seed)
-    mapping = DirectMapping(kind == "normalised", parameter, drawn, epochs, seed)
+    sampled = draw_pairs(divided(parameter, division)[0], parameter, pairs, seed)
+    mapping = DirectMapping(kind == "normalised", parameter, sampled, epochs, seed)
     return scores(mapping, parameter, division, MAPPINGS[kind], seed)
 
 
@@ -258,7 +260,7 @@ def exact_part(parameter: Parameter, division: str) -> Tables:
 
 
 def report(results: pd.DataFrame, configuration: Mapping[str, Any]) -> str:
-    """What is compared, and the table."""
+    """Write the text and the table."""
 
     def seeds(group: pd.DataFrame) -> pd.Series:
         return group.groupby("seed", sort=False, dropna=False)["mape_percent"].mean()
@@ -309,12 +311,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for seed in chosen.seeds
         for parameter in ENV_IDS
     ]
-    for parameter in get_args(Parameter):
+    for parameter in () if study.redraws else get_args(Parameter):
         training_file(parameter, study.out)  # here, as parts that make the same file meet
-    made = [study.run(mapping_part, mappings), study.run(policy_part, policies, out=study.out)]
-    made.append(study.run(exact_part, places))
-    together = pd.concat([tables["direct_mapping"] for tables in made if tables], ignore_index=True)
-    groups = together.groupby(["parameter", "division"])
+    tables_of_parts = [study.run(mapping_part, mappings), study.run(policy_part, policies, out=study.out)]
+    tables_of_parts.append(study.run(exact_part, places))
+    results_in_order = pd.concat([tables["direct_mapping"] for tables in tables_of_parts if tables], ignore_index=True)
+    groups = results_in_order.groupby(["parameter", "division"])
     results = pd.concat([groups.get_group(tuple(place.values())) for place in places], ignore_index=True)
     text = report(results, study.configuration)
     study.write({"direct_mapping": results}, {}, text)

@@ -99,7 +99,7 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def card_of(run: Run, scores: pd.DataFrame, command: str, minutes: float) -> dict[str, Any]:
-    """What a policy says of itself."""
+    """Write the card of a policy."""
     return {
         "env_id": run.task,
         "options": OPTIONS,
@@ -116,7 +116,7 @@ def card_of(run: Run, scores: pd.DataFrame, command: str, minutes: float) -> dic
     }
 
 
-def shown(table: pd.DataFrame) -> str:
+def summary_text(table: pd.DataFrame) -> str:
     """The summary for readers."""
     cells: dict[str, Cell] = {
         "environment": "{env_id}",
@@ -157,7 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for env_id, run in runs.items():
         own, file = table[table["env_id"] == env_id], study.out / f"{file_stem(env_id, recorded=False)}.onnx"
         write_card(file, card_of(run, own, study.command, made_by(run, study.out / "models")["training_minutes"]))
-    study.write({"pretrained": scores, "pretrained_summary": table}, {}, shown(table))
+    study.write({"pretrained": scores, "pretrained_summary": table}, {}, summary_text(table))
 
 
 if __name__ == "__main__":

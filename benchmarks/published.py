@@ -190,12 +190,12 @@ def part(
 
 
 def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """What disturbances do to the policies for one environment, by what it is judged by."""
+    """Tabulate each policy under each disturbance, by the measure of the environment."""
     (env_id,) = results["environment"].unique()
     measure, _ = MEASURES[env_id]
-    shown = share_with_range if measure == "died" else side_by_side
+    cell = share_with_range if measure == "died" else side_by_side
     policies = results["policy"].unique()
-    cells = {name: lambda tries, name=name: shown(tries.loc[tries["policy"] == name, measure]) for name in policies}
+    cells = {name: lambda tries, name=name: cell(tries.loc[tries["policy"] == name, measure]) for name in policies}
     return table_of(results, ["disturbance", "setting"], cells)
 
 
@@ -210,7 +210,7 @@ def report(results: pd.DataFrame) -> str:
     return "\n".join(text)
 
 
-def _draw(axes: Axes, results: pd.DataFrame, x: str, y: str) -> None:
+def _plot_over_seeds(axes: Axes, results: pd.DataFrame, x: str, y: str) -> None:
     """The median over seeds, in a band from the least to the most of a seed."""
     for name, of_policy in results.groupby("policy", sort=False):
         colour, marker = STYLES[str(name)]
@@ -230,12 +230,12 @@ def _set_scale(axes: Axes, measure: str, along: str) -> None:
 
 
 def plot_learning(learning: pd.DataFrame, results: pd.DataFrame) -> Figure:
-    """What the mean action costs while policies are trained, and the share of episodes that come to rest."""
+    """Plot the cost of the mean action while policies are trained, and the share of episodes that settle."""
     envs = list(learning["environment"].unique())
     figure, panels = new_panels(2 * len(envs), 2, (3.9, 2.4), margin=(0.0, 0.3))
     measures = [(env_id, measure, label) for env_id in envs for measure, label in _LEARNED.items()]
     for axes, (env_id, measure, label) in zip(panels, measures, strict=True):
-        _draw(axes, learning[learning["environment"] == env_id], "timesteps", measure)
+        _plot_over_seeds(axes, learning[learning["environment"] == env_id], "timesteps", measure)
         references = results[(results["environment"] == env_id) & (results["policy"] == REFERENCE)]
         level = references.loc[references["disturbance"] == "none", measure].mean()
         axes.axhline(level, color=STYLES[REFERENCE][0], ls="--", lw=1.0, label=REFERENCE)
@@ -249,13 +249,13 @@ def plot_learning(learning: pd.DataFrame, results: pd.DataFrame) -> Figure:
 
 
 def plot_impulses(results: pd.DataFrame) -> Figure:
-    """What impulses of a size do, by what an environment is judged by."""
+    """Plot the measure of an environment by the size of impulses."""
     pushed = results[results["disturbance"].isin(["none", "impulses"])]
     envs = list(pushed["environment"].unique())
     figure, panels = new_panels(len(envs), 2, (3.9, 2.6), margin=(0.0, 0.3))
     for axes, env_id in zip(panels, envs, strict=True):
         measure, label = MEASURES[env_id]
-        _draw(axes, pushed[pushed["environment"] == env_id], "impulse", measure)
+        _plot_over_seeds(axes, pushed[pushed["environment"] == env_id], "impulse", measure)
         axes.set(title=env_id, xlabel=_IMPULSES[env_id], ylabel=label)
         _set_scale(axes, measure, "y")
     add_legend(figure, panels[:1], 3)
@@ -263,15 +263,15 @@ def plot_impulses(results: pd.DataFrame) -> Figure:
 
 
 def plot_changes(results: pd.DataFrame) -> Figure:
-    """What all other changes do: each seed, and the median."""
+    """Plot the measure under all other changes: each seed, and the median."""
     changed = results[results["disturbance"] != "impulses"]
     envs = list(changed["environment"].unique())
     figure, panels = new_panels(len(envs), 2, (5.0, 4.6), margin=(0.0, 0.3))
     for axes, env_id in zip(panels, envs, strict=True):
-        of_env = changed[changed["environment"] == env_id]
-        labels = list(dict.fromkeys(of_env["setting"]))
+        env_rows = changed[changed["environment"] == env_id]
+        labels = list(dict.fromkeys(env_rows["setting"]))
         measure, label = MEASURES[env_id]
-        for name, of_policy in of_env.groupby("policy", sort=False):
+        for name, of_policy in env_rows.groupby("policy", sort=False):
             colour, marker = STYLES[str(name)]
             axes.plot(of_policy[measure], of_policy["setting"].map(labels.index), ".", color=colour, alpha=0.35, ms=4)
             medians = of_policy.groupby("setting")[measure].median()
@@ -302,8 +302,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(str(error))
     study.configuration["disturbances"] = {env_id: DISTURBANCES[env_id] for env_id in chosen.envs}
     parts = [each | {"episodes": chosen.episodes} for each in parts]
-    made = study.run(part, parts, models=study.out / "models", compiled=chosen.compile)
-    tables = in_order(made, [*DISTURBANCES, *STYLES])
+    parts_tables = study.run(part, parts, models=study.out / "models", compiled=chosen.compile)
+    tables = in_order(parts_tables, [*DISTURBANCES, *STYLES])
     results = tables["published"]
     figures = {
         "learning": plot_learning(tables["learning"], results),

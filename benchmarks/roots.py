@@ -53,7 +53,7 @@ def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -
 
 
 def percent_off(model: OffPolicyAlgorithm, task: str) -> float:
-    """How far off the parameter of held-out discharges is, in the mean, by the mean action."""
+    """Mean error of the parameter of held-out discharges with the mean action, in percent."""
     env = gym.make(task, split="test", episode_steps=BATTERY_STEPS)
     (parameter,) = env.unwrapped.task.parameters  # type: ignore[attr-defined]
     errors = []
@@ -86,9 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run_of(task, algorithm, seed, chosen.timesteps)
         for seed, task, algorithm in product(chosen.seeds, chosen.envs, chosen.algos)
     ]
-    done = make_rows(study, runs, score)
+    rows = make_rows(study, runs, score)
     cells = {"seeds": lambda group: str(len(group)), "at the end": lambda group: with_interval(group[AT_THE_END])}
-    table = table_of(done, {"task": "environment", "algorithm": "policy"}, cells)
+    table = table_of(rows, {"task": "environment", "algorithm": "policy"}, cells)
     text = "Cost per step of the mean action, of batteries by how many percent the parameter is off; interquartile mean over\n"
     text += "seeds with its 95 % interval, lower is better:\n\n"
     study.write({}, {}, text + markdown(table))

@@ -127,7 +127,7 @@ class Run:
 
     @property
     def key(self) -> dict[str, Any]:
-        """What tells its row from others."""
+        """Columns that tell its row from other rows."""
         package, name = self.kind.split(":")
         modules = [package, *self.task.split(":")[:-1]]
         configuration = {"class": name, "settings": self.settings, "environment": self.environment, "defaults": self.defaults}
@@ -137,7 +137,7 @@ class Run:
 
     @property
     def defaults(self) -> dict[str, Any]:
-        """What the class has where nothing is stated: a change of a default makes another training."""
+        """Defaults of the class where nothing is stated: a change of a default makes another training."""
         critic = getattr(self.type.policy_aliases.get("MlpPolicy"), "critic_class", None)
         parameters = [each for kind in (self.type, critic) if kind for each in signature(kind).parameters.values()]
         stated = NOT_LEARNING | set(self.settings) | set(_evaluated(self.settings.get("policy_kwargs", {})))
@@ -210,7 +210,7 @@ class Run:
 
 
 def _version(module: str) -> str:
-    """What a module is known by: its release, or the one to come; of one's own what its source is."""
+    """Name a module by its release, or the one to come, and a module of one's own by its source."""
     if module in RELEASED:
         return f"{module} {importlib.import_module(module).__version__.partition('.dev')[0]}"
     return f"{module} {_digest_of_source(module)}"
@@ -250,13 +250,13 @@ class Rows:
 
     def of(self, runs: Sequence[Run]) -> pd.DataFrame:
         """The rows of trainings in their order, of the last release that made one."""
-        who = ["task", "algorithm", "seed", "timesteps"]
-        known = self.read().drop_duplicates(who, keep="last").set_index(who)
-        wanted = [(run.task, run.algorithm, run.seed, run.timesteps) for run in runs]
-        return known.loc[[each for each in wanted if each in known.index]].reset_index()
+        identity = ["task", "algorithm", "seed", "timesteps"]
+        last_rows = self.read().drop_duplicates(identity, keep="last").set_index(identity)
+        keys = [(run.task, run.algorithm, run.seed, run.timesteps) for run in runs]
+        return last_rows.loc[[each for each in keys if each in last_rows.index]].reset_index()
 
     def has(self, run: Run) -> bool:
-        """Whether a training is done."""
+        """Tell whether a training is done."""
         rows = self.read()
         return bool((rows[_KEY].astype(str) == pd.Series(run.key).astype(str)).all(axis="columns").any())
 
@@ -265,8 +265,8 @@ class Rows:
         self.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(self.folder / ".runs.lock"):
             # as texts: no number changes for being read and written
-            together = pd.concat([self.read(str), rows.astype({name: str for name in _KEY})])
-            write_csv(self.folder, "runs", together.drop_duplicates(_KEY).to_csv(index=False))
+            table = pd.concat([self.read(str), rows.astype({name: str for name in _KEY})])
+            write_csv(self.folder, "runs", table.drop_duplicates(_KEY).to_csv(index=False))
 
 
 def save_checkpoint(model: BaseAlgorithm, file: Path, progress: Mapping[str, Any]) -> None:
@@ -417,17 +417,17 @@ def train_or_load(
 
 
 def record_file(run: Run, folder: Path) -> Path:
-    """Where :func:`train_or_load` says what made a model."""
+    """File in which :func:`train_or_load` records what made a model."""
     return folder / f"model_{run.name}.json"
 
 
 def checkpoint_file(run: Run, folder: Path) -> Path:
-    """Where the checkpoint of a training lies."""
+    """File of the checkpoint of a training."""
     return folder / f"checkpoint_{run.name}.zip"
 
 
 def made_by(run: Run, folder: Path) -> dict[str, Any]:
-    """What made a model that is there."""
+    """Read the record of a model that is there."""
     record = recall(record_file(run, folder))
     assert record is not None
     return record
@@ -467,16 +467,16 @@ class Trainer:
         progress = Progress(run, checkpoint_file(run, self.checkpoints), self.judge, self.deadline)
         model = train(progress, self.compiled)
         machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-        made = {"minutes": progress.seconds / 60.0, "resumed": progress.resumed, "machine": machine}
-        made["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
+        provenance = {"minutes": progress.seconds / 60.0, "resumed": progress.resumed, "machine": machine}
+        provenance["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
         curve = {f"after_{100 * point // POINTS}_percent": value for point, value in enumerate(progress.curve, 1)}
-        row = {**run.key, **curve, **(self.describe(model, run) if self.describe else {}), **made}
+        row = {**run.key, **curve, **(self.describe(model, run) if self.describe else {}), **provenance}
         Rows(self.folder).add(pd.DataFrame([row]))
         progress.file.unlink(missing_ok=True)
 
 
 def rows_command_line(name: str, document: str | None, timesteps: str) -> argparse.ArgumentParser:
-    """What studies of such rows have in common: their folder is that of what is published."""
+    """Make the command line of a study of such rows, whose folder is that of the published tables."""
     parser = command_line(name, document)
     parser.set_defaults(out=Path("docs/results") / name)
     parser.add_argument("--seeds", nargs="+", type=natural, default=[1, 2, 3, 4, 5])
@@ -506,8 +506,8 @@ def make_rows(study: Study, runs: Sequence[Run], judge: Judge, describe: Judge |
         describe = importable(describe) if describe else None
         trainer = Trainer(study.out, chosen.checkpoints, importable(judge), describe, deadline, chosen.compile)
         study.each(trainer, [(run,) for run in runs if not rows.has(run)])
-    done = rows.of(runs)
-    whole = done[done.groupby(["task", "algorithm"])["seed"].transform("nunique") == len(set(chosen.seeds))]
-    if whole.empty:
+    rows_of_runs = rows.of(runs)
+    complete = rows_of_runs[rows_of_runs.groupby(["task", "algorithm"])["seed"].transform("nunique") == len(set(chosen.seeds))]
+    if complete.empty:
         raise SystemExit("No algorithm has all of its seeds on a task yet: the same command goes on from the checkpoints.")
-    return whole
+    return complete

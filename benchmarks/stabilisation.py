@@ -97,7 +97,7 @@ class Contender:
     defaults: bool = False
 
     def run(self, env_id: str, seed: int, timesteps: int | None) -> Run:
-        """What is trained."""
+        """Return the training."""
         chosen = {name: getattr(self, name) for name in ("settings_of", "differing", "defaults", "label")}
         return zoo_run(self.algo, env_id, seed, timesteps, **chosen)
 
@@ -211,7 +211,7 @@ def in_order(tables: Tables, order: Sequence[str]) -> dict[str, pd.DataFrame]:
 
 
 def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """What policies cost and where they end, without disturbances."""
+    """Tabulate costs and final errors of policies without disturbances."""
     cells: dict[str, Cell] = {
         "seeds": of_trained(lambda group: str(len(group))),
         "updates": of_trained(lambda group: f"{group['updates'].max():.0f}"),
@@ -225,13 +225,15 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def undisturbed_text(results: pd.DataFrame) -> list[str]:
-    """The same, as Markdown below what its numbers are."""
-    said = "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of episodes "
-    return [f"{said}are means (least to most of a seed):\n", markdown(undisturbed_table(results))]
+    """Write this table as Markdown, below a caption."""
+    caption = (
+        "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of episodes "
+    )
+    return [f"{caption}are means (least to most of a seed):\n", markdown(undisturbed_table(results))]
 
 
 def disturbed_table(results: pd.DataFrame, cell: Callable[[pd.DataFrame], str]) -> pd.DataFrame:
-    """What each disturbance does, as one cell says of all tries of a policy."""
+    """Tabulate each disturbance, with one cell for all tries of a policy."""
     conditions = results["disturbance"].unique()
     cells = {name: lambda tries, name=name: cell(tries[tries["disturbance"] == name]) for name in conditions}
     return table_of(results, ["environment", "policy"], cells)
@@ -248,27 +250,27 @@ def ends_of(tries: pd.DataFrame) -> str:
 
 
 def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
-    """What the certificates say."""
+    """Tabulate the certificates."""
 
-    def known(values: pd.Series) -> str:
+    def interval_or_dash(values: pd.Series) -> str:
         return with_interval(values.dropna()) if values.notna().any() else "-"
 
     of_critics = certificates["function"] == "critic"
-    shown = certificates.assign(policy=certificates["policy"] + np.where(of_critics, " (critic)", ""))
+    labelled = certificates.assign(policy=certificates["policy"] + np.where(of_critics, " (critic)", ""))
     for column in ("cost_bound", "cost_bound_alpha3"):
-        shown[f"held_{column}"] = shown[column].where(shown["holds"])
+        labelled[f"held_{column}"] = labelled[column].where(labelled["holds"])
     cells: dict[str, Cell] = {
         "holds": ("holds", count_of),
         f"settles at {SETTLED_SHARE:g} of the start": ("settles", count_of),
         "cost at the start": ("start_cost", lambda costs: digits(costs.mean())),
-        "where it holds: mean cost settles below": ("held_cost_bound", known),
-        "its alpha3": ("held_cost_bound_alpha3", known),
+        "where it holds: mean cost settles below": ("held_cost_bound", interval_or_dash),
+        "its alpha3": ("held_cost_bound_alpha3", interval_or_dash),
         "alpha3 without residual": ("largest_feasible_alpha3", with_interval),
-        "cost-to-go by L, slope": ("calibration_slope", known),
+        "cost-to-go by L, slope": ("calibration_slope", interval_or_dash),
         # stated once for a policy, with the fitted function
         "survives, at least": ("survives_at_least", lambda shares: digits(shares.mean())),
     }
-    return table_of(shown, ["environment", "policy"], cells)
+    return table_of(labelled, ["environment", "policy"], cells)
 
 
 def report(tables: Tables) -> str:
@@ -295,9 +297,9 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
     envs = list(learning["environment"].unique())
     figure, panels = new_panels(len(envs), 3, (3.1, 2.3), margin=(0.0, 0.4))
     for axes, env_id in zip(panels, envs, strict=True):
-        of_env = learning[learning["environment"] == env_id]
+        env_rows = learning[learning["environment"] == env_id]
         for name, (colour, marker) in STYLES.items():
-            of_policy = of_env[of_env["policy"] == name]
+            of_policy = env_rows[env_rows["policy"] == name]
             if len(of_policy) and of_policy["seed"].isna().all():
                 axes.axhline(float(of_policy["cost"].iloc[0]), color=colour, ls="--", lw=1.0, label=name)
             elif not of_policy.empty:
@@ -340,8 +342,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ValueError as error:
         parser.error(str(error))
     study.configuration["disturbances"] = {env_id: conditions(env_id) for env_id in chosen.envs}
-    made = study.run(part, [each | judged for each in parts], models=study.out / "models", compiled=chosen.compile)
-    tables = in_order(made, [*DISTURBANCES, *STYLES])
+    parts_tables = study.run(part, [each | judged for each in parts], models=study.out / "models", compiled=chosen.compile)
+    tables = in_order(parts_tables, [*DISTURBANCES, *STYLES])
     study.write(tables, {"learning": plot_learning(tables["learning"])}, report(tables))
 
 

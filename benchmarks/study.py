@@ -60,7 +60,7 @@ def own_versions() -> dict[str, str]:
 
 def versions() -> dict[str, str]:
     """The versions that a result depends on."""
-    found = {
+    by_package = {
         **own_versions(),
         "python": platform.python_version(),
         "system": platform.platform(),
@@ -68,10 +68,10 @@ def versions() -> dict[str, str]:
     }
     for package in _PACKAGES:
         try:
-            found[package] = version(package)
+            by_package[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return by_package
 
 
 def write_text(path: Path, text: str) -> None:
@@ -139,9 +139,9 @@ def new_panels(
 def add_legend(figure: Figure, panels: Iterable[Axes], columns: int, order: Iterable[str] | None = None) -> None:
     """A legend below all panels, with one entry for each name that any of them has."""
     handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    shown = list(handles) if order is None else [name for name in order if name in handles]
-    entries = [handles[name] for name in shown]
-    figure.legend(entries, shown, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
+    labels = list(handles) if order is None else [name for name in order if name in handles]
+    entries = [handles[name] for name in labels]
+    figure.legend(entries, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
 
 
 def digits(value: float, significant: int = 2) -> str:
@@ -178,12 +178,12 @@ def share_with_range(values: pd.Series) -> str:
 
 
 def share_in_percent(values: pd.Series) -> str:
-    """Which share of them is true."""
+    """Share that is true, in percent."""
     return f"{100 * values.mean():.0f}"
 
 
 def count_of(values: pd.Series) -> str:
-    """How many of a few are true."""
+    """Number of a few that are true."""
     return f"{values.sum()} of {len(values)}"
 
 
@@ -211,26 +211,26 @@ def table_of(rows: pd.DataFrame, by: Sequence[str] | Mapping[str, str], cells: M
     """
     titles = by if isinstance(by, Mapping) else dict(zip(by, by, strict=True))
     groups = rows.groupby(list(titles), sort=False, dropna=False)
-    return pd.DataFrame([dict(zip(titles.values(), keys, strict=True)) | _said(cells, group) for keys, group in groups])
+    return pd.DataFrame([dict(zip(titles.values(), keys, strict=True)) | _cells_of(cells, group) for keys, group in groups])
 
 
 def row_by_row(rows: pd.DataFrame, cells: Mapping[str, Cell]) -> pd.DataFrame:
     """A table with what is said of each row, by title."""
-    return pd.DataFrame([_said(cells, row) for row in rows.to_dict("records")])
+    return pd.DataFrame([_cells_of(cells, row) for row in rows.to_dict("records")])
 
 
-def _said(cells: Mapping[str, Cell], of: Any) -> dict[str, Any]:
-    def said(cell: Cell) -> Any:
+def _cells_of(cells: Mapping[str, Cell], of: Any) -> dict[str, Any]:
+    def cell_of(cell: Cell) -> Any:
         if isinstance(cell, str):
             return cell.format_map(of)
         return cell[1](of[cell[0]]) if isinstance(cell, tuple) else cell(of)
 
-    return {title: said(cell) for title, cell in cells.items()}
+    return {title: cell_of(cell) for title, cell in cells.items()}
 
 
-def of_trained(said: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
+def of_trained(cell: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
     """A cell that says nothing of rows without a seed, as of a calibrator or a controller that nobody trained."""
-    return lambda group: "" if group["seed"].isna().all() else said(group)
+    return lambda group: "" if group["seed"].isna().all() else cell(group)
 
 
 def natural(text: str) -> int:
@@ -277,8 +277,8 @@ def run_named(
 
 def command_line(name: str, document: str | None, jobs: int | None = 2) -> argparse.ArgumentParser:
     """
-    What the command lines of all studies have in common: ``--jobs``, ``--scheduler``, ``--redraw`` and ``--out``. The name is
-    that of the module, and of the study if the module has several.
+    Make the command line of a study, with what all have in common: ``--jobs``, ``--scheduler``, ``--redraw`` and ``--out``.
+    The name is that of the module, and of the study if the module has several.
     """
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks.{name}", description=document, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -344,16 +344,18 @@ class Study:
         where = list(missing)
         runs = [(partial(importable(part), **places), arguments) for arguments in missing.values()]
         self.each(_make, runs, lambda number, content: write_json(where[number], content))
-        made = [_tables_of(recall(file)) for file in files]
-        names = dict.fromkeys(name for tables in made for name in tables)
-        return {name: pd.concat([tables[name] for tables in made if name in tables], ignore_index=True) for name in names}
+        made_tables = [_tables_of(recall(file)) for file in files]
+        names = dict.fromkeys(name for tables in made_tables for name in tables)
+        return {
+            name: pd.concat([tables[name] for tables in made_tables if name in tables], ignore_index=True) for name in names
+        }
 
     def done(self, part: Callable[..., Tables]) -> list[tuple[dict[str, Any], Tables]]:
         """The arguments and the tables of all parts that lie in ``<out>/parts``, whichever command made them."""
-        kept = {file: recall(file) for file in sorted((self.out / "parts").glob(f"{part.__name__}_*.json"))}
+        records = {file: recall(file) for file in sorted((self.out / "parts").glob(f"{part.__name__}_*.json"))}
         return [
             (content["arguments"], _tables_of(content))
-            for file, content in kept.items()
+            for file, content in records.items()
             if content and file == self._file_of(part, content["arguments"])  # not of another version
         ]
 
@@ -435,8 +437,8 @@ def importable(function: Callable[..., Result]) -> Callable[..., Result]:
 
 def recall(file: Path) -> dict[str, Any] | None:
     """
-    What a file says of something that is done, which is written last; None if there is none. A damaged one is set aside, and
-    what it stood for is made again.
+    Read the file that is written last of something that is done; None if there is none. A damaged file is set aside, and its
+    content is made again.
     """
     if not file.exists():
         return None

@@ -231,7 +231,7 @@ def _of_one(observations: Any, n: int) -> Any:
 
 def steps_as_one_batch(spec: EnvSpec) -> bool:
     """
-    Whether all copies of an environment can be stepped by one call: it is registered with a vector environment that lets
+    Tell whether all copies of an environment can be stepped by one call: it is registered with a vector environment that lets
     Stable-Baselines3 say when episodes start anew, and without wrappers that a vector environment would go without.
     """
     if spec.vector_entry_point is None or spec.max_episode_steps is not None or spec.additional_wrappers:

@@ -248,14 +248,14 @@ def main(args: Sequence[str] | None = None) -> None:
     defaults.add_argument("--env")
     if trains:
         defaults.add_argument("-conf", "--conf-file")
-    known, options = defaults.parse_known_args(parsed.options)
+    defaulted, options = defaults.parse_known_args(parsed.options)
     # That of the RL Zoo has discrete actions
-    known.env = known.env or ("Pendulum-v1" if known.algo in ALGORITHMS else "CartPole-v1")
-    options += ["--algo", known.algo, "--env", known.env]
+    defaulted.env = defaulted.env or ("Pendulum-v1" if defaulted.algo in ALGORITHMS else "CartPole-v1")
+    options += ["--algo", defaulted.algo, "--env", defaulted.env]
     if trains:
         # The RL Zoo says which algorithms there are
         with suppress(FileNotFoundError):
-            options += ["--conf-file", known.conf_file or str(find_config(known.algo, known.env))]
+            options += ["--conf-file", defaulted.conf_file or str(find_config(defaulted.algo, defaulted.env))]
     if parsed.command == "optimize":
         options += ["--optimize-hyperparameters"]
     sys.argv = [f"{prog} {parsed.command}", *options]

@@ -257,9 +257,9 @@ def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
         env.seed(0)
         env.set_options(options)
         # Copied, for wrappers that stack frames return the same array again
-        seen = flatten(env.reset())  # type: ignore[arg-type]
-        first = seen if first is None else first
-        if not np.array_equal(seen, first):
+        observation = flatten(env.reset())  # type: ignore[arg-type]
+        first = observation if first is None else first
+        if not np.array_equal(observation, first):
             return
     raise ValueError(
         "The environment starts in the same state whatever reset(options={'state': ...}) says: it needs a wrapper that "
@@ -269,7 +269,7 @@ def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
 
 def _stay_within(episodes: pd.DataFrame, ultimate_bound: float) -> pd.Series:
     """
-    Whether episodes survive, and the last fifth of each costs no more than a bound. It is a comparison in single precision, in
+    Tell whether episodes survive, and the last fifth of each costs no more than a bound. It compares in single precision, in
     which some vector environments hold rewards: there a cost of 0.1 is a little more than 0.1.
     """
     within = episodes["largest_late_cost"].astype(np.float32) <= np.float32(ultimate_bound)
