@@ -246,7 +246,7 @@ def check_bound(ultimate_bound: float | None) -> None:
 
 
 def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
-    """Check that an environment starts where it is told to."""
+    """Check that an environment starts in the stated states."""
     # Not every vector environment takes options for each of its elements
     env.set_options([{"state": starts[k % len(starts)].tolist()} for k in range(env.num_envs)])
     env.reset()
@@ -262,8 +262,8 @@ def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
         if not np.array_equal(observation, first):
             return
     raise ValueError(
-        "The environment starts in the same state whatever reset(options={'state': ...}) says: it needs a wrapper that "
-        "puts it into the state that it is given. (If it starts in the only one of starts anyway, leave starts out.)"
+        "The environment ignores reset(options={'state': ...}). Let its reset() start in options['state'], or wrap it so. "
+        "Without a choice of initial states, leave starts out."
     )
 
 
