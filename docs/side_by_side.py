@@ -1,6 +1,7 @@
 """
 The moving picture of the first page: the same episode of one problem under LAC and under SAC, each with its settings of
-``zoo_configs``, after equally many steps of training, seed 0. Below, how far off its goal either has been so far.
+``zoo_configs`` (LAC with its default root), after equally many steps of training, seed 0. Below, how far off its goal either
+has been so far.
 
 .. code-block:: bash
 
@@ -22,7 +23,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import COLOUR_OF
 from benchmarks import control
-from benchmarks.runs import train_or_load
+from benchmarks.runs import control_networks, train_or_load
 from benchmarks.study import EVALUATION_SEED
 from benchmarks.zoo_runs import zoo_run
 from docs.environment_pictures import EPISODES, PICTURES, in_few_colours, save_moving
@@ -89,8 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--models", type=Path, default=Path("results") / "side_by_side", help="where models are kept")
     models = parser.parse_args(arguments).models
     halves, errors_m = [], {}
-    for algo in ("lac", "sac"):
-        policy = train_or_load(zoo_run(algo, ENV, SEED, TIMESTEPS), models)
+    for algo, differing in (("lac", {"policy_kwargs": control_networks()}), ("sac", {})):
+        policy = train_or_load(zoo_run(algo, ENV, SEED, TIMESTEPS, differing=differing), models)
         error_m = control.roll_out(policy, lambda: gym.make(ENV), EPISODES_BESIDE, EVALUATION_SEED)["error"]
         print(f"{algo.upper()}: {error_m.median():.2g} m off at the end, median of {EPISODES_BESIDE} starts")
         pictures, errors_m[algo.upper()] = episode(policy, algo.upper())
