@@ -14,7 +14,7 @@ from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
 from battery_env.electrochemistry.aging_path import PATH_DISTANCE_LIMIT_SD, PATH_NAMES, AgingPath
-from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO, correlation_share, independent_errors
+from battery_env.electrochemistry.model_error import CORRELATION_SHARE, UNFITTED_ERROR_RATIO, independent_errors
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimates.findings import Reason
@@ -334,7 +334,7 @@ class LeastSquares(Estimator):
                 noise_V or 1.0,
                 cell.r_o,
                 cell.to,
-                correlation_share("forecast") * starts[0]["q_mobile"],
+                CORRELATION_SHARE * starts[0]["q_mobile"],
                 history.load_on_C,
                 tuple((each.begin_s, each.end_s) for each in dropouts_of(record, cell)),
             )
