@@ -55,8 +55,3 @@ def check_parameters(parameters: Sequence[str]) -> tuple[str, ...]:
     if not names or len(set(names)) < len(names) or set(names) - set(PARAMETERS):
         raise ValueError(f"parameters must be one or both of {PARAMETER_NAMES}, got {parameters!r}")
     return names
-
-
-def columns_of(parameters: Sequence[str]) -> list[int]:
-    """Return the columns of parameters in an array of (q_mobile, r_o)."""
-    return [PARAMETER_NAMES.index(name) for name in parameters]

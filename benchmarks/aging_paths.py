@@ -53,7 +53,7 @@ from battery_env.records import integrate_load
 from battery_env.records.discharge import BUNDLED_CELLS, Discharge
 from battery_env.records.model import RecordModel
 from benchmarks.kalman_filter import PlainKalmanFilter
-from benchmarks.runs import setting_of_lac
+from benchmarks.runs import Run, control_networks, made_by, train_or_load
 from benchmarks.study import (
     Cell,
     Study,
@@ -68,7 +68,7 @@ from benchmarks.study import (
     table_of,
     versions,
 )
-from benchmarks.training import Recipe, train_or_load, training_minutes
+from benchmarks.zoo_runs import zoo_run
 from sb3_lac.onnx import export_onnx
 
 CUT_OFF_V = 2.7
@@ -130,25 +130,24 @@ def path_of(cells: Sequence[str], folder: Path) -> tuple[AgingPath, Path]:
     return AgingPath.from_json(file), file
 
 
-def recipe_of(algo: str, cells: Sequence[str], seed: int, folder: Path) -> Recipe:
-    """How a policy learns along the path of some lives."""
+def run_of(algo: str, cells: Sequence[str], seed: int, folder: Path) -> Run:
+    """Training of a policy along the path of some lives."""
     path, file = path_of(cells, folder)
     data = file.with_name(file.name.replace("path_", "cells_")).with_suffix(".npz")
     if not data.exists():
         with suppress(FileExistsError):
             TrajectoryDataset.along(path, TRAINING_CELLS, Loads(), seed=0).save(data)
     options = {**OPTIONS, **TRAINED_WITH, "path": str(file), "dataset": str(data)}
-    networks = setting_of_lac(4 if algo == "lac" else None)["policy_kwargs"]
-    own = {"env_kwargs": options, "policy_kwargs": networks}
-    return Recipe.of(algo, ENV_ID, seed, updates=UPDATES, hyperparameters=own)
+    own = {"env_kwargs": options, "policy_kwargs": control_networks(4 if algo == "lac" else None)}
+    return zoo_run(algo, ENV_ID, seed, updates=UPDATES, differing=own)
 
 
 def training(algo: str, lives: Sequence[str], seed: int, folder: Path) -> Tables:
     """Train one policy, unless that has been done."""
-    recipe = recipe_of(algo, lives, seed, folder)
-    train_or_load(recipe, folder / "models")
-    row = {"algo": algo, "lives": " ".join(lives), "seed": seed, "minutes": training_minutes(recipe, folder / "models")}
-    return {"trainings": pd.DataFrame([row])}
+    run = run_of(algo, lives, seed, folder)
+    train_or_load(run, folder / "models")
+    minutes = made_by(run, folder / "models")["training_minutes"]
+    return {"trainings": pd.DataFrame([{"algo": algo, "lives": " ".join(lives), "seed": seed, "minutes": minutes}])}
 
 
 def part(judged: str, every: int, folder: Path, method: str | None = None, **policies: Any) -> Tables:
@@ -173,7 +172,7 @@ def part(judged: str, every: int, folder: Path, method: str | None = None, **pol
 def learned(judged: str, every: int, method: str, algo: str, seeds: Sequence[int], folder: Path) -> Tables:
     """The discharges of a cell by policies that learned along the path of the other one, their actions averaged."""
     path = path_of([CELLS[judged]], folder)[0]
-    policies = [train_or_load(recipe_of(algo, [CELLS[judged]], seed, folder), folder / "models") for seed in seeds]
+    policies = [train_or_load(run_of(algo, [CELLS[judged]], seed, folder), folder / "models") for seed in seeds]
     estimator = PolicyEstimator(MeanPolicy(policies), ENV_ID, path=path, **OPTIONS)
     wholes = [_Whole(each) for each in load_nasa_discharges(judged)[1::every]]
     rows = []
@@ -206,7 +205,7 @@ class _Whole:
 def _row(
     path: AgingPath, whole: _Whole, share: float, record: Discharge, found: Estimate, mismatch_V: float | None = None
 ) -> dict[str, object]:
-    """What an estimate along a path is worth, in per cent of ``q_mobile``, and its end."""
+    """Errors of an estimate along a path, in per cent of ``q_mobile``, and of its end."""
     row: dict[str, object] = {"share": share, "settled": found.settled_q_mobile}
     row |= {"q_error_percent": 100.0 * (found.q_mobile / whole.q_mobile - 1.0)}
     if share == 1.0:
@@ -226,7 +225,7 @@ def _end(whole: _Whole, quantiles_s: Sequence[float] | FloatArray) -> dict[str, 
 def _said(
     path: AgingPath, life: str, labelled: Sequence[Discharge], whole: _Whole, last: Discharge
 ) -> Iterator[dict[str, object]]:
-    """What each method says of a discharge at each share of its time."""
+    """Rows of each method on a discharge at each share of its time."""
     yield from _along(path, PATH.format(life), whole)
     for share in SHARES[:-1]:
         seen = whole.seen(share)
@@ -240,7 +239,7 @@ def _said(
 
 
 def _along(path: AgingPath, method: str, whole: _Whole) -> Iterator[dict[str, object]]:
-    """What least squares say of a discharge along a path."""
+    """Rows of least squares on a discharge along a path."""
     for share in SHARES:
         record = whole.seen(share).loaded_part(CUT_OFF_V)
         yield {"method": method, **_row(path, whole, share, record, LeastSquares(path=path).estimate(record))}
@@ -272,7 +271,7 @@ def _with_own_life(method: str, settings: Settings, before: Life, whole: _Whole)
 
 
 def _regression(labelled: Sequence[Discharge], whole: _Whole, record: Discharge) -> float:
-    """How far the end is off that a linear map of the voltages tells, learned on capacities that were measured, per cent."""
+    """Error of the end by a linear map of the voltages, learned on measured capacities, in per cent."""
     charge_C = record.charge_C
     loaded = [each.loaded_part(CUT_OFF_V) for each in labelled]
     usable = [each for each in loaded if each.charge_C > charge_C]
@@ -288,7 +287,7 @@ def _regression(labelled: Sequence[Discharge], whole: _Whole, record: Discharge)
 
 
 def _steps_V(record: Discharge, charge_C: float) -> FloatArray:
-    """How far the voltage falls over equal steps of charge, up to one."""
+    """Falls of the voltage over equal steps of charge, up to one."""
     drawn_C = integrate_load(record.time_s, record.current_A, record.time_s)
     at_C = charge_C * (np.arange(_STEPS + 1) + 0.5) / (_STEPS + 1)
     return np.diff(np.interp(at_C, drawn_C - drawn_C[0], record.voltage_V))
@@ -348,8 +347,8 @@ def export(seeds: Sequence[int], folder: Path, command: str, scores: pd.DataFram
     of policies that learned along the path of one cell and were judged on the other.
     """
     path, _ = path_of(BUNDLED_CELLS, folder)
-    recipes = [recipe_of("lac", BUNDLED_CELLS, seed, folder) for seed in seeds]
-    models = [train_or_load(recipe, folder / "models") for recipe in recipes]
+    runs = [run_of("lac", BUNDLED_CELLS, seed, folder) for seed in seeds]
+    models = [train_or_load(run, folder / "models") for run in runs]
     file = folder / f"{file_stem(ENV_ID, recorded=True)}.onnx"
     with replacing(file) as part_of_file:
         export_onnx(models, part_of_file, ENV_ID)
@@ -358,10 +357,10 @@ def export(seeds: Sequence[int], folder: Path, command: str, scores: pd.DataFram
         "options": {**OPTIONS, "path": path.to_mapping()},
         "algorithm": "LAC",
         "command": command,
-        "recipe": {**asdict(recipes[0]), "seed": list(seeds)},
+        "recipe": {**asdict(runs[0]), "seed": list(seeds)},
         "training_data": f"{TRAINING_CELLS} simulated cells along the lives of {' and '.join(BUNDLED_CELLS)}",
         "scores": scores[scores["method"].str.match("LAC, .* as one")].to_dict("records"),
-        "training_minutes": sum(training_minutes(recipe, folder / "models") for recipe in recipes),
+        "training_minutes": sum(made_by(run, folder / "models")["training_minutes"] for run in runs),
         "versions": versions(),
     }
     write_card(file, card)

@@ -28,6 +28,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import coloured
+from benchmarks import roots
 from benchmarks.control import DISTURBANCES, IMPULSE_INTERVAL, conditions, roll_out
 from benchmarks.runs import Run, make_rows, rows_command_line, setting_of_lac
 from benchmarks.study import Study, add_legend, digits, markdown, natural, new_panels, table_of, with_interval
@@ -45,13 +46,7 @@ PARAMETERS = {
 #: What is outside of the ranges of pushes and noises, in parts of their ends; delays are a step longer.
 BEYOND = 1.5
 TIMESTEPS = 30_000
-ALGORITHMS = {
-    "lac": ("LAC", "sb3_lac:LAC"),
-    "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC"),
-    "lac_fourth_root": ("LAC (root=4)", "sb3_lac:LAC"),
-    "sac": ("SAC", "stable_baselines3:SAC"),
-    "tqc": ("TQC", "sb3_contrib:TQC"),
-}
+ALGORITHMS = {**roots.ALGORITHMS, "tqc": ("TQC", "sb3_contrib:TQC", None)}
 #: Whom they are compared with.
 RIVALS = ("SAC", "TQC")
 EPISODES = 100
@@ -61,8 +56,8 @@ _CURVE_EPISODES, _CURVE_SEED = 30, 40_000
 LEVEL = 0.98
 
 
-def drawn(env_id: str) -> dict[str, tuple[float, float]]:
-    """What each episode of a training draws: up to what the published table of robustness tries policies with."""
+def ranges_of(env_id: str) -> dict[str, tuple[float, float]]:
+    """Ranges that each training episode samples from: up to what the published table of robustness tries policies with."""
     impulse, _, process_noise, observation_noise, delay = DISTURBANCES[env_id]
     name, ends, _ = PARAMETERS[env_id]
     largest = {"impulse": impulse, "process_noise": process_noise, "observation_noise": observation_noise}
@@ -84,11 +79,10 @@ def outside(env_id: str) -> dict[str, dict[str, Any]]:
 
 def run_of(env_id: str, algorithm: str, seed: int, last_actions: int = 0, timesteps: int | None = None) -> Run:
     """A training of this study."""
-    label, kind = ALGORITHMS[algorithm]
-    environment = {"drawn": drawn(env_id), "impulse_interval": IMPULSE_INTERVAL}
+    label, kind, root = ALGORITHMS[algorithm]
+    environment = {"drawn": ranges_of(env_id), "impulse_interval": IMPULSE_INTERVAL}
     if last_actions:
         label, environment["last_actions"] = f"{label}, {last_actions} last actions", last_actions
-    root = {"lac_fourth_root": 4, "lac_square_root": 2}.get(algorithm)
     return Run(env_id, label, kind, seed, timesteps or TIMESTEPS, setting_of_lac(root), environment)
 
 
@@ -100,39 +94,39 @@ def cost_while_training(model: OffPolicyAlgorithm, run: Run) -> float:
 
 def costs(model: OffPolicyAlgorithm, run: Run) -> dict[str, float]:
     """Cost per step, and share of episodes that die, under each disturbance within the ranges and outside."""
-    seen = {name: value for name, value in run.environment.items() if name == "last_actions"}
+    last_actions = {name: value for name, value in run.environment.items() if name == "last_actions"}
     tried = {**conditions(run.task), **{f"outside: {name}": each for name, each in outside(run.task).items()}}
-    found: dict[str, float] = {}
+    results: dict[str, float] = {}
     for name, arguments in tried.items():
-        outcome = roll_out(model, partial(gym.make, run.task, **arguments, **seen), EPISODES)
-        found |= {name: outcome["cost"].mean(), f"died: {name}": outcome["died"].mean()}
-    return found
+        outcome = roll_out(model, partial(gym.make, run.task, **arguments, **last_actions), EPISODES)
+        results |= {name: outcome["cost"].mean(), f"died: {name}": outcome["died"].mean()}
+    return results
 
 
 def cost_table(rows: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     """Interquartile means over seeds with their intervals, and the share of episodes that die, if some do."""
 
-    def said(group: pd.DataFrame, name: str) -> str:
+    def cost_and_deaths(group: pd.DataFrame, name: str) -> str:
         died = group[f"died: {name}"].mean()
         return with_interval(group[name]) + (f" ({digits(100 * died, 1)} %)" if died > 0 else "")
 
     cells = {"seeds": lambda group: str(len(group))}
-    cells |= {name.removeprefix("outside: "): partial(said, name=name) for name in names}
+    cells |= {name.removeprefix("outside: "): partial(cost_and_deaths, name=name) for name in names}
     return table_of(rows, {"task": "environment", "algorithm": "policy"}, cells)
 
 
-def cells_held(rows: pd.DataFrame, names: list[str], ours: str) -> str:
+def cells_held(rows: pd.DataFrame, names: list[str], candidate: str) -> str:
     """In how many cells a kind of LAC is ahead of the best of the others that saw the same, or level with it."""
-    _, comma, seen = ours.partition(",")
-    held, of = 0, 0
-    for _, of_env in rows.groupby("task", sort=False):
-        by_name, there = of_env.groupby("algorithm"), set(of_env["algorithm"])
-        rivals = [rival for rival in (f"{name}{comma}{seen}" for name in RIVALS) if rival in there]
-        if ours in there and rivals:
-            lac, *others = (over_seeds(by_name.get_group(each)[names])[0] for each in (ours, *rivals))
-            held += int((LEVEL * lac <= np.min(others, axis=0)).sum())
-            of += len(names)
-    return f"{ours}: {held} of {of}"
+    _, comma, suffix = candidate.partition(",")
+    n_held, n_cells = 0, 0
+    for _, task_rows in rows.groupby("task", sort=False):
+        by_name, algorithms = task_rows.groupby("algorithm"), set(task_rows["algorithm"])
+        rivals = [rival for rival in (f"{name}{comma}{suffix}" for name in RIVALS) if rival in algorithms]
+        if candidate in algorithms and rivals:
+            lac, *rival_costs = (over_seeds(by_name.get_group(each)[names])[0] for each in (candidate, *rivals))
+            n_held += int((LEVEL * lac <= np.min(rival_costs, axis=0)).sum())
+            n_cells += len(names)
+    return f"{candidate}: {n_held} of {n_cells}"
 
 
 def plot(rows: pd.DataFrame, names: Sequence[str]) -> Figure:
@@ -140,10 +134,10 @@ def plot(rows: pd.DataFrame, names: Sequence[str]) -> Figure:
     tasks = list(rows["task"].unique())
     figure, panels = new_panels(len(tasks), 3, (3.6, 3.6), margin=(0.6, 0.3))
     for axes, task in zip(panels, tasks, strict=True):
-        of_task = rows[rows["task"] == task]
-        policies = list(of_task["algorithm"].unique())
+        task_rows = rows[rows["task"] == task]
+        policies = list(task_rows["algorithm"].unique())
         for n, (colour, policy) in enumerate(coloured(policies)):
-            middle, low, high = over_seeds(of_task.loc[of_task["algorithm"] == policy, list(names)])
+            middle, low, high = over_seeds(task_rows.loc[task_rows["algorithm"] == policy, list(names)])
             places = np.arange(len(names)) + 0.7 * (n + 0.5) / len(policies) - 0.35
             axes.hlines(places, low, high, color=colour, lw=1.4)
             axes.plot(middle, places, "o", color=colour, ms=4, label=policy)
@@ -162,8 +156,8 @@ def report(rows: pd.DataFrame, within: list[str], beyond: list[str]) -> str:
     for where, names in (("Within the ranges of the training", within), ("Outside of them", beyond)):
         text += f"{where}: cost per step, interquartile mean over seeds with its 95 % interval, and the share of episodes\n"
         text += "that die. Cells in which LAC is ahead of the best of the others, or within 2 %:\n"
-        ours = [name for name in rows["algorithm"].unique() if name.startswith("LAC")]
-        text += f"{'; '.join(cells_held(rows, names, each) for each in ours)}.\n\n"
+        lac_names = [name for name in rows["algorithm"].unique() if name.startswith("LAC")]
+        text += f"{'; '.join(cells_held(rows, names, each) for each in lac_names)}.\n\n"
         text += markdown(cost_table(rows, names)) + "\n"
     return text.rstrip() + "\n"
 
@@ -180,11 +174,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run_of(env_id, algorithm, seed, last_actions, chosen.timesteps)
         for seed, env_id, last_actions, algorithm in product(chosen.seeds, chosen.envs, chosen.last_actions, chosen.algos)
     ]
-    study.configuration["drawn"] = {env_id: drawn(env_id) for env_id in chosen.envs}
-    done = make_rows(study, runs, cost_while_training, costs)
+    study.configuration["drawn"] = {env_id: ranges_of(env_id) for env_id in chosen.envs}
+    rows = make_rows(study, runs, cost_while_training, costs)
     within = list(conditions(chosen.envs[0]))
     beyond = [f"outside: {name}" for name in outside(chosen.envs[0])]
-    study.write({}, {"costs": plot(done, [*within, *beyond])}, report(done, within, beyond))
+    study.write({}, {"costs": plot(rows, [*within, *beyond])}, report(rows, within, beyond))
 
 
 if __name__ == "__main__":

@@ -19,9 +19,10 @@ Policies of full-state tasks are scored on all held-out discharges, from exact s
 closed form; those of voltage-only tasks on the first 100, under two sensors, beside least squares and a Kalman filter that
 read every second; and in all other environments by the returns of episodes with the mean action.
 
-Every run has a folder of its own, named by its recipe: algorithm, environment, seed, steps, evaluations, hyperparameters and
-version of this project. A run that is finished is not run again; with another recipe it is. An interrupted run goes on from
-its last checkpoint when the same command is given again; it does not equal an uninterrupted one then, and the table says so.
+Every run has a folder of its own, named by its recipe: algorithm, environment, seed, steps, hyperparameters and version of
+this project. A run that is finished is not run again; with another recipe it is. Every two minutes a run writes a checkpoint.
+An interrupted run goes on from there when the same command is given again; it does not equal an uninterrupted one then, and
+the table says so.
 The tables and the figures show all finished runs in the folder, so that runs can be added, and name the recipe of each row;
 the JSON files beside them spell the recipes out. ``tensorboard --logdir <out>/tensorboard`` shows the runs in common charts,
 with the hyperparameters of all of them in one table.
@@ -32,7 +33,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import itertools
-import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -41,89 +41,76 @@ from typing import Any
 
 import gymnasium as gym
 import pandas as pd
+from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 from battery_env.callbacks import CALIBRATION_CHARTS, CalibrationCallback
 from benchmarks.contests import EVALUATION_EPISODES, contest_of, recipes_of
+from benchmarks.runs import Run, checkpoint_file, made_by, record_file, registered_id, train_or_load
 from benchmarks.study import Study, Tables, command_line, markdown, natural, positive
-from benchmarks.training import (
-    DEFAULTS_TIMESTEPS,
-    Recipe,
-    Training,
-    alone,
-    finished_model,
-    made_by,
-    record_file,
-    registered_id,
-    set_up,
-)
+from benchmarks.zoo_runs import DEFAULTS_TIMESTEPS, zoo_run
 from sb3_lac import DashboardCallback, LyapunovCallback
 from sb3_lac.cost_algorithm import CostAlgorithm
 
 
-def part(recipe: dict[str, Any], out: Path) -> Tables:
-    """
-    Train one policy, unless that has been done, and score it. One that was interrupted goes on from its last checkpoint.
-    """
-    made_from = Recipe(**recipe)
-    folder, of_env, every = _folder(made_from, out), contest_of(made_from.env_id), made_from.evaluation_freq
+def part(algo: str, source: str, run: dict[str, Any], out: Path, evaluations: int) -> Tables:
+    """Train one policy, unless that has been done, and score it; ``algo`` and ``source`` are for the table."""
+    made_from = Run(**run)
+    folder, contest = _folder(made_from, out), contest_of(made_from.task)
+    every = max(made_from.timesteps // (evaluations * made_from.n_envs), 1)
     curve = folder / f"learning_{made_from.name}.csv"
-    options = {"eval_env_kwargs": dict(of_env.options)}
-    with alone(made_from, folder), contextlib.closing(Training(made_from, folder, **options)) as training:
-        env = training.evaluation_env()
-        if (model := finished_model(made_from, folder)) is None:
-            model = training.model
-            if model.num_timesteps == 0:  # what began and left no checkpoint left no curve
-                curve.unlink(missing_ok=True)
-            callbacks: list[BaseCallback] = [
-                CalibrationCallback(
-                    lambda candidate: of_env.scores(candidate, env, brief=True), every, of_env.metrics, curve, verbose=0
-                ),
-                EvalCallback(training.evaluation_env(), n_eval_episodes=EVALUATION_EPISODES, eval_freq=every, verbose=0),
-                *_dashboard(training),
-            ]
-            log = f"{made_from.label.replace(' ', '_')}_seed{made_from.seed}_{made_from.digest}"
-            training.run(callbacks, out / "tensorboard" / of_env.env_id / log)
-        return {"scores": of_env.scores(model, env), "learning": pd.read_csv(curve)}
+    if not checkpoint_file(made_from, folder).exists() and not record_file(made_from, folder).exists():
+        curve.unlink(missing_ok=True)  # what began and left no checkpoint left no curve
 
+    def new_env() -> VecEnv:
+        env = made_from.environments(1, **contest.options)
+        env.seed(made_from.seed)
+        return env
 
-def _dashboard(training: Training) -> list[BaseCallback]:
-    """What makes a run part of a comparison in TensorBoard, and changes nothing of the training."""
-    recipe = training.recipe
-    about = {"env": recipe.env_id, "recipe": recipe.digest, "timesteps": recipe.timesteps, "source": recipe.source}
-    callbacks: list[BaseCallback] = [DashboardCallback(CALIBRATION_CHARTS, {**recipe.hyperparameters, **about})]
-    if isinstance(training.model, CostAlgorithm):
+    env = new_env()
+    about = {"env": made_from.task, "recipe": made_from.digest, "timesteps": made_from.timesteps, "source": source}
+    callbacks: list[BaseCallback] = [
+        CalibrationCallback(
+            lambda candidate: contest.scores(candidate, env, brief=True), every, contest.metrics, curve, verbose=0
+        ),
+        EvalCallback(new_env(), n_eval_episodes=EVALUATION_EPISODES, eval_freq=every, verbose=0),
+        DashboardCallback(CALIBRATION_CHARTS, {**run["settings"], **about}),
+    ]
+    if issubclass(made_from.type, CostAlgorithm):
         # from the same start states each time, which are not those of the training
-        seed, env = recipe.seed + training.model.n_envs, training.evaluation_env()
-        callbacks.append(LyapunovCallback(env, None, EVALUATION_EPISODES, recipe.evaluation_freq, seed, verbose=0))
-    return callbacks
+        seed = made_from.seed + made_from.n_envs
+        callbacks.append(LyapunovCallback(new_env(), None, EVALUATION_EPISODES, every, seed, verbose=0))
+    log = f"{made_from.algorithm.replace(' ', '_')}_seed{made_from.seed}_{made_from.digest}"
+    model = train_or_load(made_from, folder, callbacks=callbacks, log=out / "tensorboard" / contest.env_id / log)
+    return {"scores": contest.scores(model, env), "learning": pd.read_csv(curve)}
 
 
-def _folder(recipe: Recipe, out: Path) -> Path:
-    return out / registered_id(recipe.env_id) / recipe.name
+def _folder(run: Run, out: Path) -> Path:
+    return out / registered_id(run.task) / run.name
 
 
 def finished_runs(study: Study) -> pd.DataFrame:
-    """What the finished runs in a folder say, one row per run, with its tables."""
+    """Collect the finished runs of a folder, one row per run, with its tables."""
     rows = []
     for arguments, tables in study.done(part):
-        recipe = Recipe(**arguments["recipe"])
-        of_run = made_by(recipe, _folder(recipe, study.out))
-        summary = contest_of(recipe.env_id).summary(tables["scores"])
+        run = Run(**arguments["run"])
+        record = made_by(run, _folder(run, study.out))
+        summary = contest_of(run.task).summary(tables["scores"])
         rows.append(
             {
-                "env": registered_id(recipe.env_id),
-                "algo": recipe.algo,
-                "hyperparameters": recipe.source,
-                "recipe": recipe.digest,
-                "seed": recipe.seed,
+                "env": registered_id(run.task),
+                "algo": arguments["algo"],
+                "hyperparameters": arguments["source"],
+                "recipe": run.digest,
+                "seed": run.seed,
                 # an algorithm with roll-outs of fixed length makes more than it is asked for
-                "timesteps": of_run["timesteps"],
-                "label": recipe.label,
+                "timesteps": record["timesteps"],
+                "label": run.algorithm,
                 "scores": summary.get("scores"),
-                **{name: of_run[name] for name in ("updates", "resumed", "training_minutes")},
+                **{name: record[name] for name in ("updates", "resumed", "training_minutes")},
                 "time_per_update_us": summary["time_per_update_us"],
-                "made_by": of_run,
+                "made_by": record,
                 "tables": tables,
             }
         )
@@ -141,39 +128,37 @@ def report(study: Study) -> None:
     runs = finished_runs(study)
     if runs.empty:
         return
-    shown: dict[tuple[str, ...], list[pd.DataFrame]] = {}  # a table for readers for each set of columns
+    tables_by_columns: dict[tuple[str, ...], list[pd.DataFrame]] = {}  # a table for readers for each set of columns
     tables = []
-    for _, of_env in runs.groupby("env"):
-        for_readers, table = contest_of(of_env["made_by"].iloc[0]["recipe"]["env_id"]).report(of_env, study)
+    for _, env_runs in runs.groupby("env"):
+        for_readers, table = contest_of(env_runs["made_by"].iloc[0]["run"]["task"]).report(env_runs, study)
         tables.append(table)
-        shown.setdefault(tuple(for_readers.columns), []).append(for_readers)
-    together = pd.concat(tables, ignore_index=True)
-    if len(together) > 0:
-        study.write_table("compare", together, recipes_of(runs))
-    texts = [markdown(pd.concat(of_columns)) for of_columns in shown.values()]
+        tables_by_columns.setdefault(tuple(for_readers.columns), []).append(for_readers)
+    summary = pd.concat(tables, ignore_index=True)
+    if len(summary) > 0:
+        study.write_table("compare", summary, recipes_of(runs))
+    texts = [markdown(pd.concat(of_columns)) for of_columns in tables_by_columns.values()]
     resumed = runs[runs["resumed"] > 0]
     if len(resumed) > 0:
-        said = "Interrupted and continued from a checkpoint, with other random numbers than an uninterrupted run has:\n\n"
+        text = "Interrupted and continued from a checkpoint, with other random numbers than an uninterrupted run has:\n\n"
         for _, of_run in resumed.iterrows():
             times = "once" if of_run["resumed"] == 1 else f"{of_run['resumed']} times"
-            said += f"- {of_run['label']} on {of_run['env']}, seed {of_run['seed']}: {times}\n"
-        texts.append(said)
+            text += f"- {of_run['label']} on {of_run['env']}, seed {of_run['seed']}: {times}\n"
+        texts.append(text)
     study.write({}, {}, "\n".join(texts))
 
 
-def _check(recipe: Recipe, out: Path) -> None:
+def _check(run: Run, out: Path) -> None:
     """Refuse what could not be trained or scored, before anything is."""
-    if recipe.algo == "ppo_lstm":
-        raise ValueError("ppo_lstm: policies with a memory cannot be scored here")
-    contest_of(recipe.env_id)
-    if not record_file(recipe, _folder(recipe, out)).exists():
+    if issubclass(run.type, RecurrentPPO):
+        raise ValueError(f"{run.algorithm}: policies with a memory cannot be scored here")
+    contest_of(run.task)
+    if not record_file(run, _folder(run, out)).exists():
         try:
-            with tempfile.TemporaryDirectory() as folder:
-                env = set_up(recipe, Path(folder))[1].env
-                assert env is not None
-                env.close()
+            with contextlib.closing(run.environments()) as env:
+                run.model(env)
         except (AssertionError, TypeError, ValueError) as error:
-            raise ValueError(f"{recipe.algo} on {recipe.env_id}: {error}") from error
+            raise ValueError(f"{run.algorithm} on {run.task}: {error}") from error
 
 
 def _differing(settings: Sequence[str]) -> defaultdict[str, dict[str, Any]]:
@@ -217,10 +202,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         default=[],
         help="what differs, like learning_rate:lin_1e-3, or sac.tau:0.02 for one algorithm or environment",
     )
-    parser.add_argument("--evaluations", type=positive, default=10, help="evaluations and checkpoints during each run")
+    parser.add_argument("--evaluations", type=positive, default=10, help="evaluations during each run")
     study = Study(parser, arguments)
     chosen = study.chosen
-    given = {"timesteps": chosen.timesteps, "defaults": chosen.defaults, "evaluations": chosen.evaluations}
+    options = {"timesteps": chosen.timesteps, "defaults": chosen.defaults}
+    source = "defaults" if chosen.defaults else "zoo_configs"
     try:
         differing = _differing(chosen.hyperparams)
         names = {name: name.rpartition(":")[2] for name in (*chosen.envs, *chosen.algos)}
@@ -230,16 +216,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
             (algo, env_id): {**differing[""], **differing[names[env_id]], **differing[names[algo]]}
             for algo, env_id in itertools.product(chosen.algos, chosen.envs)
         }
-        recipes = [
-            [Recipe.of(algo, env_id, seed, hyperparameters=differ[algo, env_id], **given) for algo in chosen.algos]
-            for env_id, seed in itertools.product(chosen.envs, chosen.seeds)
+        runs = [
+            (algo, zoo_run(algo, env_id, seed, differing=differ[algo, env_id], **options))
+            for env_id, seed, algo in itertools.product(chosen.envs, chosen.seeds, chosen.algos)
         ]
-        for recipe in {recipe.digest: recipe for of_seed in recipes for recipe in of_seed}.values():
-            _check(recipe, study.out)
+        for run in {run.digest: run for _, run in runs}.values():
+            _check(run, study.out)
     except (ValueError, FileNotFoundError, gym.error.Error) as error:
         parser.error(str(error))
     try:
-        study.run(part, [{"recipe": asdict(recipe)} for of_seed in recipes for recipe in of_seed], out=study.out)
+        parts = [{"algo": algo, "source": source, "run": asdict(run)} for algo, run in runs]
+        study.run(part, parts, out=study.out, evaluations=chosen.evaluations)
     finally:
         report(study)  # of those that finished
 

@@ -32,6 +32,7 @@ from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.full_state.full_state_task import FullStateTask
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks.kalman_filter import PlainKalmanFilter
+from benchmarks.runs import registered_id
 from benchmarks.study import (
     EVALUATION_SEED,
     SYMBOLS,
@@ -45,7 +46,6 @@ from benchmarks.study import (
     with_interval,
     with_spread,
 )
-from benchmarks.training import registered_id
 
 #: What the voltmeter does to the test discharges of voltage-only tasks.
 SENSORS: dict[str, SensorErrors | RandomSensorErrors] = {
@@ -81,7 +81,7 @@ def held_out_trajectories(env_id: str) -> TrajectoryDataset:
 
 class Contest(ABC):
     """
-    What algorithms are compared by in one kind of environment.
+    Scores by which algorithms are compared in one kind of environment.
 
     :param env_id: id of the environment
     :ivar env_id: the same, without the module that registers it
@@ -105,7 +105,7 @@ class Contest(ABC):
         """Score a policy."""
 
     def summary(self, scores: pd.DataFrame) -> dict[str, Any]:
-        """What is kept of a run beside its scores."""
+        """Summarise the scores of a run."""
         return {"time_per_update_us": 1e6 * float(scores["time_per_update_s"].iloc[0])}
 
     @abstractmethod
@@ -214,8 +214,8 @@ class FullState(Calibration):
             "end of discharge (%)": ("eod_error_percent", with_spread),
             **_TIMES,
         }
-        shown = table_of(table, {"env": "environment", "parameter": "parameter", "label": "calibrator"}, cells)
-        return shown, table.drop(columns=["label", *OF_RUN])
+        for_readers = table_of(table, {"env": "environment", "parameter": "parameter", "label": "calibrator"}, cells)
+        return for_readers, table.drop(columns=["label", *OF_RUN])
 
 
 class VoltageOnly(Calibration):
@@ -243,10 +243,10 @@ class VoltageOnly(Calibration):
 
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
         self.write_learning(runs, study)
-        who = ["label", "seed", "training_minutes", "tables"]
+        columns = ["label", "seed", "training_minutes", "tables"]
         tables = [
             run["scores"].assign(calibrator=label, seed=seed, training_minutes=minutes)
-            for label, seed, minutes, run in runs[who].itertuples(index=False)
+            for label, seed, minutes, run in runs[columns].itertuples(index=False)
         ]
         peers = [{"env_id": self.env_id, "calibrator": name} for name in self.peers()]
         scores = pd.concat([*tables, study.run(peer_scores, peers)["scores"]], ignore_index=True)
@@ -335,7 +335,7 @@ class Episodes(Contest):
 
 
 def contest_of(env_id: str) -> Contest:
-    """What algorithms are compared by in an environment."""
+    """Return the contest of an environment."""
     try:
         task = PolicyEstimator.environment(registered_id(env_id)).task
     except ValueError:
@@ -344,7 +344,7 @@ def contest_of(env_id: str) -> Contest:
 
 
 def plot_ranks(scores: pd.DataFrame, parameters: Sequence[str]) -> Figure:
-    """Which share of the discharges has an error in its second half below a value, for each calibrator, over seeds."""
+    """Plot the share of discharges with a smaller error in their second half, for each calibrator, over seeds."""
     sensors = list(dict.fromkeys(scores["sensor"]))
     figure = new_figure(4.0 * len(parameters) + 0.6, 2.7 * len(sensors) + 0.4)
     panels = figure.subplots(len(sensors), len(parameters), squeeze=False, sharex="col", sharey=True)
@@ -368,10 +368,10 @@ def plot_ranks(scores: pd.DataFrame, parameters: Sequence[str]) -> Figure:
 
 
 def recipes_of(runs: pd.DataFrame) -> dict[str, Any]:
-    """What made the runs of a table."""
+    """Collect the recipes of the runs of a table."""
     recipes: dict[str, Any] = {}
     for digest, of_run in zip(runs["recipe"], runs["made_by"], strict=True):
-        recipe = dict(of_run["recipe"])
+        recipe = {**of_run["run"], "defaults": of_run["defaults"]}
         seed = {"seed": recipe.pop("seed"), "resumed": of_run["resumed"], "versions": of_run["versions"]}
         recipes.setdefault(digest, {**recipe, "runs": []})["runs"].append(seed)
     return {"recipes": recipes}

@@ -101,16 +101,16 @@ def roll_out(
 
 def shares_of(outcome: pd.DataFrame, tolerance: float) -> dict[str, float]:
     """The shares of the episodes of a roll-out that end at the goal, and that go a part of the way; the dead have not."""
-    left = (outcome["error"] / outcome["error_at_start"]).where(~outcome["died"], np.inf)
+    remaining = (outcome["error"] / outcome["error_at_start"]).where(~outcome["died"], np.inf)
     return {
         "at_goal": ((outcome["error"] <= tolerance) & ~outcome["died"]).mean(),
-        "within_1_percent": (left <= 0.01).mean(),
-        "within_0.1_percent": (left <= 0.001).mean(),
+        "within_1_percent": (remaining <= 0.01).mean(),
+        "within_0.1_percent": (remaining <= 0.001).mean(),
     }
 
 
 def summary(outcome: pd.DataFrame, tolerance: float) -> dict[str, float]:
-    """What the episodes of a roll-out cost, and where they end."""
+    """Summarise the costs of the episodes of a roll-out, and where they end."""
     return {
         "cost": outcome["cost"].mean(),
         "cost_worst": outcome["cost"].max(),

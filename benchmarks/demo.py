@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,8 +26,9 @@ from battery_env import PolicyEstimator, TrajectoryDataset, evaluate
 from battery_env.callbacks import CalibrationCallback
 from battery_env.lab.batch import workers
 from battery_env.plotting import plot_learning_curves, plot_true_against_inferred, save_figure
+from benchmarks.runs import train_or_load
 from benchmarks.study import importable
-from benchmarks.training import Recipe, Training
+from benchmarks.zoo_runs import zoo_run
 
 RESULTS = Path("results")
 ENV, PARAMETER, CELL = "BatteryRo-v0", "r_o", "B0005"
@@ -38,7 +39,7 @@ EVALUATIONS, EVERY, EVERY_IN_THE_END = 5, 40, 8
 
 
 class Learned(NamedTuple):
-    """What one algorithm reached: its errors while it learned, and on each discharge in the end."""
+    """Errors of one algorithm: while it learned, and on each discharge in the end."""
 
     curve: pd.DataFrame
     scores: pd.DataFrame
@@ -47,29 +48,29 @@ class Learned(NamedTuple):
 def learned(algo: str) -> Learned:
     """Train one policy by its entry in zoo_configs."""
     _, test = TrajectoryDataset.paper(PARAMETER).split(test=0.3, seed=0)
-    recipe = Recipe.of(algo, ENV, 0, updates=UPDATES, evaluations=EVALUATIONS)
+    run = zoo_run(algo, ENV, 0, updates=UPDATES)
     callback = CalibrationCallback(
         lambda model: evaluate(PolicyEstimator(model, ENV), test[::EVERY]),
-        recipe.evaluation_freq,
+        run.timesteps // (EVALUATIONS * run.n_envs),
         {f"{PARAMETER}_mape_percent": "mape_percent"},
         verbose=0,
     )
-    with tempfile.TemporaryDirectory() as folder, closing(Training(recipe, Path(folder))) as training:
-        training.run([callback])
-        scores = evaluate(PolicyEstimator(training.model, ENV), test[::EVERY_IN_THE_END])
+    with tempfile.TemporaryDirectory() as folder:
+        model = train_or_load(run, Path(folder), callbacks=[callback])
+    scores = evaluate(PolicyEstimator(model, ENV), test[::EVERY_IN_THE_END])
     return Learned(pd.DataFrame(callback.history), scores)
 
 
 def compared(out: Path) -> str:
     """Train the algorithms side by side, draw what they reached, and say it."""
     with workers(len(ALGORITHMS)) as executor:
-        found = dict(zip(map(str.upper, ALGORITHMS), executor.map(importable(learned), ALGORITHMS), strict=True))
-    scores = {algo: each.scores for algo, each in found.items()}
+        results = dict(zip(map(str.upper, ALGORITHMS), executor.map(importable(learned), ALGORITHMS), strict=True))
+    scores = {algo: each.scores for algo, each in results.items()}
     save_figure(plot_true_against_inferred(scores, PARAMETER), out / f"{ENV}_inferred.png")
-    save_figure(plot_learning_curves({algo: [each.curve] for algo, each in found.items()}, ENV), out / f"{ENV}_learning.png")
+    save_figure(plot_learning_curves({algo: [each.curve] for algo, each in results.items()}, ENV), out / f"{ENV}_learning.png")
     errors = {algo: each[f"{PARAMETER}_mape_percent"] for algo, each in scores.items()}
-    said = ", ".join(f"{algo} {error.mean():.2g} % ({error.max():.2g} %)" for algo, error in errors.items())
-    return f"R_o of held-out simulated cells, mean error (worst discharge): {said}"
+    summary = ", ".join(f"{algo} {error.mean():.2g} % ({error.max():.2g} %)" for algo, error in errors.items())
+    return f"R_o of held-out simulated cells, mean error (worst discharge): {summary}"
 
 
 @contextmanager

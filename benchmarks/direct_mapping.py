@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -35,6 +36,7 @@ from battery_env.parameters import PARAMETER_NAMES
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.tasks.full_state.layout import LITERAL, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
+from benchmarks.runs import train_or_load
 from benchmarks.study import (
     SYMBOLS,
     Cell,
@@ -49,7 +51,7 @@ from benchmarks.study import (
     table_of,
     with_spread,
 )
-from benchmarks.training import Recipe, train_or_load
+from benchmarks.zoo_runs import zoo_run
 
 Parameter = Literal["q_mobile", "r_o"]
 Parts = tuple[TrajectoryDataset, TrajectoryDataset]
@@ -93,9 +95,9 @@ def divided(parameter: Parameter, division: str) -> Parts:
 def train_policy(algo: str, parameter: Parameter, seed: int, updates: int | None, out: Path) -> BaseAlgorithm:
     """Train a policy on the less aged cells, or load it if that has been done."""
     env_id = ENV_IDS[parameter]
-    options = Recipe.of(algo, env_id, seed).hyperparameters.get("env_kwargs", {})
-    chosen = {"env_kwargs": {**options, "dataset": str(training_file(parameter, out))}}
-    return train_or_load(Recipe.of(algo, env_id, seed, updates=updates, hyperparameters=chosen), out / "models")
+    run = zoo_run(algo, env_id, seed, updates=updates)
+    on_less_aged = {**run.environment, "dataset": str(training_file(parameter, out))}
+    return train_or_load(replace(run, environment=on_less_aged), out / "models")
 
 
 def training_file(parameter: Parameter, out: Path) -> Path:
@@ -189,23 +191,25 @@ class DirectMapping(Estimator):
     def infer(self, pairs: Pairs) -> FloatArray:
         """The parameter of each pair."""
         with th.no_grad():
-            told = [self.network(chunk) for chunk in self._inputs.to_tensor(_inputs(pairs)).split(_CHUNK)]
-        scaled = th.cat(told).numpy().astype(np.float64)
+            inferred = [self.network(chunk) for chunk in self._inputs.to_tensor(_inputs(pairs)).split(_CHUNK)]
+        scaled = th.cat(inferred).numpy().astype(np.float64)
         return (self._labels.mean + self._labels.spread * scaled)[:, 0]
 
     def trace(self, records: Sequence[Trajectory]) -> list[EstimateTrace]:  # type: ignore[override]
         """One estimate for every step of many discharges."""
-        whole = list(records)
+        discharges = list(records)
         pairs = Pairs(
-            np.concatenate([record.state[:-1, OBSERVED] for record in whole]),
-            np.concatenate([record.state[1:, OBSERVED] for record in whole]),
-            np.concatenate([record.load[:-1] for record in whole]),
+            np.concatenate([record.state[:-1, OBSERVED] for record in discharges]),
+            np.concatenate([record.state[1:, OBSERVED] for record in discharges]),
+            np.concatenate([record.load[:-1] for record in discharges]),
             np.empty(0),
         )
-        ends = np.cumsum([len(record.time_s) - 1 for record in whole])[:-1]
+        ends = np.cumsum([len(record.time_s) - 1 for record in discharges])[:-1]
         traces = []
-        for record, told in zip(whole, np.split(self.infer(pairs), ends), strict=True):
-            values = {name: np.full(len(told), getattr(record, name)) for name in PARAMETER_NAMES} | {self.parameter: told}
+        for record, inferred in zip(discharges, np.split(self.infer(pairs), ends), strict=True):
+            values = {name: np.full(len(inferred), getattr(record, name)) for name in PARAMETER_NAMES} | {
+                self.parameter: inferred
+            }
             traces.append(EstimateTrace(record.time_s[1:], values["q_mobile"], values["r_o"]))
         return traces
 
@@ -218,7 +222,7 @@ class DirectMapping(Estimator):
 def scores(estimator: Estimator, parameter: Parameter, division: str, method: str, seed: int | None) -> Tables:
     """Score a calibrator on the test part of a division."""
     test = divided(parameter, division)[1]
-    found = evaluate(estimator, test.subset(range(0, len(test), max(len(test) // TEST_DISCHARGES, 1))))
+    scores_of_test = evaluate(estimator, test.subset(range(0, len(test), max(len(test) // TEST_DISCHARGES, 1))))
     columns = {
         "load_W": "load",
         "true": parameter,
@@ -230,7 +234,7 @@ def scores(estimator: Estimator, parameter: Parameter, division: str, method: st
         "spread": f"{parameter}_spread",
         "time_per_estimate_s": "time_per_update_s",
     }
-    table = pd.DataFrame({name: found[column] for name, column in columns.items()})
+    table = pd.DataFrame({name: scores_of_test[column] for name, column in columns.items()})
     for name, value in (("seed", seed), ("division", division), ("parameter", parameter), ("method", method)):
         table.insert(0, name, value)
     return {"direct_mapping": table}
@@ -239,8 +243,8 @@ def scores(estimator: Estimator, parameter: Parameter, division: str, method: st
 def mapping_part(kind: str, parameter: Parameter, division: str, seed: int, pairs: int, epochs: int) -> Tables:
     """Teach one direct mapping, and score it."""
     th.set_num_threads(1)
-    drawn = draw_pairs(divided(parameter, division)[0], parameter, pairs, seed)
-    mapping = DirectMapping(kind == "normalised", parameter, drawn, epochs, seed)
+    sampled = draw_pairs(divided(parameter, division)[0], parameter, pairs, seed)
+    mapping = DirectMapping(kind == "normalised", parameter, sampled, epochs, seed)
     return scores(mapping, parameter, division, MAPPINGS[kind], seed)
 
 
@@ -256,7 +260,7 @@ def exact_part(parameter: Parameter, division: str) -> Tables:
 
 
 def report(results: pd.DataFrame, configuration: Mapping[str, Any]) -> str:
-    """What is compared, and the table."""
+    """Write the text and the table."""
 
     def seeds(group: pd.DataFrame) -> pd.Series:
         return group.groupby("seed", sort=False, dropna=False)["mape_percent"].mean()
@@ -307,12 +311,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for seed in chosen.seeds
         for parameter in ENV_IDS
     ]
-    for parameter in get_args(Parameter):
+    for parameter in () if study.redraws else get_args(Parameter):
         training_file(parameter, study.out)  # here, as parts that make the same file meet
-    made = [study.run(mapping_part, mappings), study.run(policy_part, policies, out=study.out)]
-    made.append(study.run(exact_part, places))
-    together = pd.concat([tables["direct_mapping"] for tables in made if tables], ignore_index=True)
-    groups = together.groupby(["parameter", "division"])
+    tables_of_parts = [study.run(mapping_part, mappings), study.run(policy_part, policies, out=study.out)]
+    tables_of_parts.append(study.run(exact_part, places))
+    results_in_order = pd.concat([tables["direct_mapping"] for tables in tables_of_parts if tables], ignore_index=True)
+    groups = results_in_order.groupby(["parameter", "division"])
     results = pd.concat([groups.get_group(tuple(place.values())) for place in places], ignore_index=True)
     text = report(results, study.configuration)
     study.write({"direct_mapping": results}, {}, text)

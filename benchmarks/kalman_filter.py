@@ -140,8 +140,8 @@ def _take(
     gain = explained / (slopes @ explained + noise_V2)
     innovation = voltage - cell_voltage(state, 0, mean[0], True, packed) - mean[2]
     # Joseph's form, which stays positive
-    kept = np.eye(3) - np.outer(gain, slopes)
-    covariance[:] = kept @ covariance @ kept.T + noise_V2 * np.outer(gain, gain)
+    reduction = np.eye(3) - np.outer(gain, slopes)
+    covariance[:] = reduction @ covariance @ reduction.T + noise_V2 * np.outer(gain, gain)
     to_q = min(max(mean[0] + gain[0] * innovation, bounds[0][0]), bounds[0][1])
     to_r_o = min(max(mean[1] + gain[1] * innovation, bounds[1][0]), bounds[1][1])
     mean[2] += gain[2] * innovation

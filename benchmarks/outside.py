@@ -9,11 +9,11 @@ LAC beside SAC, TD3 and TQC on tasks of Gymnasium, which nobody here made or tun
   python -m benchmarks.outside --merge rows/runs.csv --redraw
 
 Every algorithm has its defaults, but SAC, TD3 and TQC those settings of the RL Zoo that are tuned for a task with at most 50
-thousand steps; ``lac_zoo`` is LAC with those of SAC. ``lac_common`` is LAC with its one setting for control problems. The
-critics of ``lac_square_root`` and ``lac_fourth_root`` learn that root, and the weight of the entropy begins at 1 in
-``lac_higher_start``, as SAC's does. A policy is judged by its mean action, in 20 episodes that no training starts with. A
-training that is done is a row of ``runs.csv``, which nothing but a change of what was run makes anew. The same command goes
-on from there.
+thousand steps. ``lac_zoo`` is LAC on the car (MountainCarContinuous-v0) alone, with a square root and the RL Zoo's settings
+of SAC there. ``lac_common`` is LAC with its one setting for control problems. The critics of ``lac_square_root`` and
+``lac_fourth_root`` learn that root, and the weight of the entropy begins at 1 in ``lac_higher_start``, as SAC's does. A
+policy is judged by its mean action, in 20 episodes that no training starts with. A training that is done is a row of
+``runs.csv``, which nothing but a change of what was run makes anew. The same command goes on from there.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ _SQUARE_ROOT, _FOURTH_ROOT = ({"policy_kwargs": f"dict(root={root})"} for root i
 ALGORITHMS: dict[str, tuple[str, str, dict[str, Any] | None]] = {
     "lac": ("LAC", "sb3_lac:LAC", {}),
     "published_lac": ("LAC as published", "sb3_lac:PublishedLAC", {}),
-    "lac_common": ("LAC (root=4), its one setting", "sb3_lac:LAC", setting_of_lac()),
-    "lac_zoo": ("LAC, the RL Zoo's settings of SAC", "sb3_lac:LAC", None),
+    "lac_common": ("LAC (root=4), its one setting", "sb3_lac:LAC", setting_of_lac(4)),
+    "lac_zoo": ("LAC (root=2), SAC's settings of the car", "sb3_lac:LAC", None),
     "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC", _SQUARE_ROOT),
     "lac_fourth_root": ("LAC (root=4)", "sb3_lac:LAC", _FOURTH_ROOT),
     "lac_higher_start": ("LAC (root=4), entropy from 1", "sb3_lac:LAC", {"ent_coef": "auto", **_FOURTH_ROOT}),
@@ -77,6 +77,7 @@ _CAR = {
     "use_sde": True,
     "policy_kwargs": "dict(log_std_init=-3.67, net_arch=[64, 64], use_expln=True)",
 }
+_CAR_OF_LAC = {**_CAR, "policy_kwargs": "dict(log_std_init=-3.67, net_arch=[64, 64], use_expln=True, root=2)"}
 #: The RL Zoo's settings for a task, where it tunes for at most 50 thousand steps.
 TUNED: dict[str, dict[str, dict[str, Any]]] = {
     "Pendulum-v1": {
@@ -94,7 +95,7 @@ TUNED: dict[str, dict[str, dict[str, Any]]] = {
         },
         "tqc": {"learning_rate": 1e-3},
     },
-    "MountainCarContinuous-v0": {"lac_zoo": _CAR, "sac": _CAR, "tqc": _CAR},
+    "MountainCarContinuous-v0": {"lac_zoo": _CAR_OF_LAC, "sac": _CAR, "tqc": _CAR},
 }
 EPISODES = 20
 _CURVE = {100 * point // POINTS: f"after_{100 * point // POINTS}_percent" for point in range(1, POINTS + 1)}
@@ -107,14 +108,14 @@ def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -
 
 
 def mean_return(model: OffPolicyAlgorithm, run: Run) -> float:
-    """Of the held-out episodes."""
+    """Mean return of the held-out episodes."""
     outcome = roll_out(model, partial(gym.make, run.task), EPISODES)
     return -float((outcome["cost"] * outcome["length"]).mean())
 
 
-def difference(ours: np.ndarray, others: np.ndarray, axis: int = -1) -> np.ndarray:
-    """How much larger the mean of our scores is."""
-    return np.asarray(ours.mean(axis) - others.mean(axis))
+def difference(scores: np.ndarray, rival_scores: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Difference of the mean scores."""
+    return np.asarray(scores.mean(axis) - rival_scores.mean(axis))
 
 
 def improvement(*scores: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -125,8 +126,8 @@ def improvement(*scores: np.ndarray, axis: int = -1) -> np.ndarray:
     :param scores: ours and the others' of a task, then of the next
     """
     of_tasks = []
-    for ours, others in zip(scores[::2], scores[1::2], strict=True):
-        gain = np.moveaxis(ours, axis, -1)[..., :, None] - np.moveaxis(others, axis, -1)[..., None, :]
+    for own_scores, rival_scores in zip(scores[::2], scores[1::2], strict=True):
+        gain = np.moveaxis(own_scores, axis, -1)[..., :, None] - np.moveaxis(rival_scores, axis, -1)[..., None, :]
         of_tasks.append((0.5 * (1.0 + np.sign(gain))).mean((-2, -1)))
     return np.mean(of_tasks, axis=0)
 
@@ -136,36 +137,36 @@ def _interval(statistic: Any, scores: Sequence[np.ndarray]) -> tuple[float, floa
     middle = float(statistic(*scores))
     if min(map(len, scores)) < 2:
         return middle, np.nan, np.nan
-    drawn = bootstrap(scores, statistic, vectorized=True, n_resamples=2000, method="percentile", random_state=0)
-    return middle, float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
+    resampled = bootstrap(scores, statistic, vectorized=True, n_resamples=2000, method="percentile", random_state=0)
+    return middle, float(resampled.confidence_interval.low), float(resampled.confidence_interval.high)
 
 
 def comparison(rows: pd.DataFrame) -> pd.DataFrame:
     """LAC against each rival, on each task and on all that both have rows of."""
     scores = {key: group[AT_THE_END].to_numpy() for key, group in rows.groupby(["task", "algorithm"], sort=False)}
-    found = []
-    for ours, rival in product(OURS, RIVALS):
-        tasks = [task for task in TASKS if (task, ours) in scores and (task, rival) in scores]
+    rows_of_pairs = []
+    for lac, rival in product(OURS, RIVALS):
+        tasks = [task for task in TASKS if (task, lac) in scores and (task, rival) in scores]
         for task in tasks:
-            pair = [scores[task, ours], scores[task, rival]]
-            found.append([task, ours, rival, *_interval(difference, pair), *_interval(improvement, pair)])
+            pair = [scores[task, lac], scores[task, rival]]
+            rows_of_pairs.append([task, lac, rival, *_interval(difference, pair), *_interval(improvement, pair)])
         if len(tasks) > 1:
-            of_all = [scores[task, algorithm] for task in tasks for algorithm in (ours, rival)]
-            found.append(["all", ours, rival, *[np.nan] * 3, *_interval(improvement, of_all)])
+            of_all = [scores[task, algorithm] for task in tasks for algorithm in (lac, rival)]
+            rows_of_pairs.append(["all", lac, rival, *[np.nan] * 3, *_interval(improvement, of_all)])
     of_difference, of_probability = ([name, f"{name}_low", f"{name}_high"] for name in ("difference", "probability"))
-    return pd.DataFrame(found, columns=["task", "ours", "rival", *of_difference, *of_probability])
+    return pd.DataFrame(rows_of_pairs, columns=["task", "ours", "rival", *of_difference, *of_probability])
 
 
 def report(rows: pd.DataFrame, compared: pd.DataFrame) -> str:
     """The returns and the comparison, as Markdown."""
-    shown = {name: label for name, (label, *_) in ALGORITHMS.items() if name in set(rows["algorithm"])}
+    labels = {name: label for name, (label, *_) in ALGORITHMS.items() if name in set(rows["algorithm"])}
     returns = [
-        {"task": task, "steps": str(of_task["timesteps"].max()), "seeds": str(of_task["seed"].nunique())}
+        {"task": task, "steps": str(task_rows["timesteps"].max()), "seeds": str(task_rows["seed"].nunique())}
         | {
-            label: with_interval(own[AT_THE_END]) if len(own := of_task[of_task["algorithm"] == name]) else ""
-            for name, label in shown.items()
+            label: with_interval(own[AT_THE_END]) if len(own := task_rows[task_rows["algorithm"] == name]) else ""
+            for name, label in labels.items()
         }
-        for task, of_task in rows.groupby("task", sort=False)
+        for task, task_rows in rows.groupby("task", sort=False)
     ]
     cells = [
         {
@@ -195,9 +196,9 @@ def plot_learning(rows: pd.DataFrame) -> Figure:
     tasks = list(rows["task"].unique())
     figure, panels = new_panels(len(tasks), 4, (3.1, 2.3), margin=(0.0, 0.4))
     for axes, task in zip(panels, tasks, strict=True):
-        of_task = rows[rows["task"] == task]
+        task_rows = rows[rows["task"] == task]
         for colour, (label, name) in coloured((label, name) for name, (label, *_) in ALGORITHMS.items()):
-            own = of_task[of_task["algorithm"] == name]
+            own = task_rows[task_rows["algorithm"] == name]
             if len(own):
                 steps = np.array(list(_CURVE)) / 100 * own["timesteps"].iloc[0]
                 draw_over_seeds(axes, steps, own[list(_CURVE.values())], colour, label)
@@ -225,9 +226,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for seed, task, algorithm in product(chosen.seeds, in_order, chosen.algos)
         if ALGORITHMS[algorithm][2] is not None or algorithm in TUNED.get(task, {})
     ]
-    done = make_rows(study, runs, mean_return)
-    compared = comparison(done)
-    study.write({"comparison": compared}, {"learning": plot_learning(done)}, report(done, compared))
+    rows = make_rows(study, runs, mean_return)
+    compared = comparison(rows)
+    study.write({"comparison": compared}, {"learning": plot_learning(rows)}, report(rows, compared))
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.policies.pretrained import file_stem, policy_of_file, write_card
 from battery_env.tasks.data import standard_dataset
 from benchmarks.contests import HELD_OUT, SENSORS
+from benchmarks.runs import Run, made_by, train_or_load
 from benchmarks.study import (
     SYMBOLS,
     Cell,
@@ -40,7 +41,7 @@ from benchmarks.study import (
     row_by_row,
     versions,
 )
-from benchmarks.training import Recipe, train_or_load, training_minutes
+from benchmarks.zoo_runs import zoo_run
 from sb3_lac.onnx import export_onnx
 
 #: What each policy finds.
@@ -55,15 +56,15 @@ TRAINED_WITH: dict[str, Any] = {**OPTIONS, "new_readings": [0, 145], "mismatch":
 MISMATCHES = (0.0, 0.1, 0.2)
 
 
-def make(env_id: str, seed: int, updates: int, folder: Path) -> Recipe:
+def make(env_id: str, seed: int, updates: int, folder: Path) -> Run:
     """Train a policy, unless that has been done, and write it as ONNX, with the options that it needs beside it."""
-    recipe = Recipe.of("lac", env_id, seed, updates=updates, hyperparameters={"env_kwargs": TRAINED_WITH})
-    model = train_or_load(recipe, folder / "models")
+    run = zoo_run("lac", env_id, seed, updates=updates, differing={"env_kwargs": TRAINED_WITH})
+    model = train_or_load(run, folder / "models")
     file = folder / f"{file_stem(env_id, recorded=False)}.onnx"
     with replacing(file) as part:
         export_onnx(model, part, env_id)
     write_card(file, {"env_id": env_id, "options": OPTIONS})
-    return recipe
+    return run
 
 
 def part(env_id: str, recipe: str, mismatch: float, sensor: str, discharges: int, folder: Path) -> Tables:
@@ -97,16 +98,16 @@ def summary(scores: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, minutes: float) -> dict[str, Any]:
-    """What a policy says of itself."""
+def card_of(run: Run, scores: pd.DataFrame, command: str, minutes: float) -> dict[str, Any]:
+    """Write the card of a policy."""
     return {
-        "env_id": recipe.env_id,
+        "env_id": run.task,
         "options": OPTIONS,
         "algorithm": "LAC",
         "command": command,
-        "recipe": asdict(recipe),
+        "recipe": asdict(run),
         "training_data": (
-            f"the training part of {recipe.env_id}: 700 simulated discharges whose kn, tDiffusion, to and tsn are off by "
+            f"the training part of {run.task}: 700 simulated discharges whose kn, tDiffusion, to and tsn are off by "
             f"factors with a relative standard deviation of {MISMATCH:g}, 1 to 30 mV of noise and an offset within 10 mV"
         ),
         "training_minutes": minutes,
@@ -115,7 +116,7 @@ def card_of(recipe: Recipe, scores: pd.DataFrame, command: str, minutes: float) 
     }
 
 
-def shown(table: pd.DataFrame) -> str:
+def summary_text(table: pd.DataFrame) -> str:
     """The summary for readers."""
     cells: dict[str, Cell] = {
         "environment": "{env_id}",
@@ -138,25 +139,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     study = Study(parser, arguments)
     chosen = study.chosen
     study.configuration |= {"trained_with": TRAINED_WITH, "options": OPTIONS}
-    recipes = {env_id: make(env_id, chosen.seed, chosen.updates, study.out) for env_id in chosen.envs}
+    runs = {env_id: make(env_id, chosen.seed, chosen.updates, study.out) for env_id in chosen.envs}
     parts = [
         {
             "env_id": env_id,
-            "recipe": f"{recipe.digest}_{recipe.seed}",
+            "recipe": f"{run.digest}_{run.seed}",
             "mismatch": mismatch,
             "sensor": sensor,
             "discharges": chosen.discharges,
         }
-        for env_id, recipe in recipes.items()
+        for env_id, run in runs.items()
         for mismatch in MISMATCHES
         for sensor in SENSORS
     ]
     scores = study.run(part, parts, folder=study.out)["pretrained"]
     table = summary(scores)
-    for env_id, recipe in recipes.items():
+    for env_id, run in runs.items():
         own, file = table[table["env_id"] == env_id], study.out / f"{file_stem(env_id, recorded=False)}.onnx"
-        write_card(file, card_of(recipe, own, study.command, training_minutes(recipe, study.out / "models")))
-    study.write({"pretrained": scores, "pretrained_summary": table}, {}, shown(table))
+        write_card(file, card_of(run, own, study.command, made_by(run, study.out / "models")["training_minutes"]))
+    study.write({"pretrained": scores, "pretrained_summary": table}, {}, summary_text(table))
 
 
 if __name__ == "__main__":

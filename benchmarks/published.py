@@ -31,7 +31,8 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import COLOUR_OF, COLOURS
 from benchmarks.control import tried_with
-from benchmarks.stabilisation import REFERENCE, Contender, in_order, parts_of, undisturbed_text
+from benchmarks.runs import Run
+from benchmarks.stabilisation import REFERENCE, Contender, in_order, parts_of, trained, undisturbed_text
 from benchmarks.study import (
     Study,
     Tables,
@@ -150,7 +151,7 @@ def contender(policy: str, env_id: str) -> Contender:
     own["policy_kwargs"] = {"net_arch": {"pi": [64, 64], "qf": layers}}
     if env_id == "Oscillator-v0":
         own["env_wrapper"] = "benchmarks.published.EndFarAway"
-    return Contender(algo, label, *STYLES[label], "published_lac", own, compiles=policy in HORIZONS)
+    return Contender(algo, label, *STYLES[label], "published_lac", own)
 
 
 def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> list[dict[str, Any]]:
@@ -167,8 +168,7 @@ def part(
     policy: str,
     env_id: str,
     seed: int | None,
-    timesteps: int | None,
-    recipe: str | None,
+    run: dict[str, Any] | None,
     episodes: int,
     models: Path,
     compiled: bool,
@@ -176,29 +176,26 @@ def part(
     """Train a policy, or take the reference controller, and try it."""
     predictor: PolicyPredictor
     described: dict[str, Any] = {"environment": env_id, "policy": policy, "seed": seed}
-    learning = None
-    if policy == REFERENCE:
+    tables, weight = {}, None
+    if run is None:
         predictor = reference_controller(gym.make(env_id))
-        trained: dict[str, Any] = {"timesteps": None, "updates": None, "lambda": None, "training_minutes": None}
+        took: dict[str, Any] = dict.fromkeys(("timesteps", "updates", "training_minutes"))
     else:
-        assert seed is not None
-        chosen, folder = contender(policy, env_id), models / f"{env_id}_{policy}_seed{seed}"
-        made_from = chosen.recipe(env_id, seed, timesteps)
-        predictor, updates, minutes, learning = chosen.trained(made_from, recipe, folder, compiled)
-        described["policy"] = chosen.label
+        predictor, took, learning = trained(Run(**run), models, compiled)
+        described["policy"] = run["algorithm"]
         weight = predictor.log_lambda.exp().item() if isinstance(predictor, PublishedLAC) else None
-        trained = {"timesteps": timesteps, "updates": updates, "lambda": weight, "training_minutes": minutes}
-    results = pd.DataFrame([described | trained | row for row in tried(predictor, env_id, episodes)])
-    return {"published": results} | ({} if learning is None else {"learning": learning.assign(**described)})
+        tables["learning"] = learning.assign(**described)
+    rows = [{**described, **took, "lambda": weight, **row} for row in tried(predictor, env_id, episodes)]
+    return {"published": pd.DataFrame(rows), **tables}
 
 
 def disturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """What disturbances do to the policies for one environment, by what it is judged by."""
+    """Tabulate each policy under each disturbance, by the measure of the environment."""
     (env_id,) = results["environment"].unique()
     measure, _ = MEASURES[env_id]
-    shown = share_with_range if measure == "died" else side_by_side
+    cell = share_with_range if measure == "died" else side_by_side
     policies = results["policy"].unique()
-    cells = {name: lambda tries, name=name: shown(tries.loc[tries["policy"] == name, measure]) for name in policies}
+    cells = {name: lambda tries, name=name: cell(tries.loc[tries["policy"] == name, measure]) for name in policies}
     return table_of(results, ["disturbance", "setting"], cells)
 
 
@@ -213,7 +210,7 @@ def report(results: pd.DataFrame) -> str:
     return "\n".join(text)
 
 
-def _draw(axes: Axes, results: pd.DataFrame, x: str, y: str) -> None:
+def _plot_over_seeds(axes: Axes, results: pd.DataFrame, x: str, y: str) -> None:
     """The median over seeds, in a band from the least to the most of a seed."""
     for name, of_policy in results.groupby("policy", sort=False):
         colour, marker = STYLES[str(name)]
@@ -233,12 +230,12 @@ def _set_scale(axes: Axes, measure: str, along: str) -> None:
 
 
 def plot_learning(learning: pd.DataFrame, results: pd.DataFrame) -> Figure:
-    """What the mean action costs while policies are trained, and the share of episodes that come to rest."""
+    """Plot the cost of the mean action while policies are trained, and the share of episodes that settle."""
     envs = list(learning["environment"].unique())
     figure, panels = new_panels(2 * len(envs), 2, (3.9, 2.4), margin=(0.0, 0.3))
     measures = [(env_id, measure, label) for env_id in envs for measure, label in _LEARNED.items()]
     for axes, (env_id, measure, label) in zip(panels, measures, strict=True):
-        _draw(axes, learning[learning["environment"] == env_id], "timesteps", measure)
+        _plot_over_seeds(axes, learning[learning["environment"] == env_id], "timesteps", measure)
         references = results[(results["environment"] == env_id) & (results["policy"] == REFERENCE)]
         level = references.loc[references["disturbance"] == "none", measure].mean()
         axes.axhline(level, color=STYLES[REFERENCE][0], ls="--", lw=1.0, label=REFERENCE)
@@ -252,13 +249,13 @@ def plot_learning(learning: pd.DataFrame, results: pd.DataFrame) -> Figure:
 
 
 def plot_impulses(results: pd.DataFrame) -> Figure:
-    """What impulses of a size do, by what an environment is judged by."""
+    """Plot the measure of an environment by the size of impulses."""
     pushed = results[results["disturbance"].isin(["none", "impulses"])]
     envs = list(pushed["environment"].unique())
     figure, panels = new_panels(len(envs), 2, (3.9, 2.6), margin=(0.0, 0.3))
     for axes, env_id in zip(panels, envs, strict=True):
         measure, label = MEASURES[env_id]
-        _draw(axes, pushed[pushed["environment"] == env_id], "impulse", measure)
+        _plot_over_seeds(axes, pushed[pushed["environment"] == env_id], "impulse", measure)
         axes.set(title=env_id, xlabel=_IMPULSES[env_id], ylabel=label)
         _set_scale(axes, measure, "y")
     add_legend(figure, panels[:1], 3)
@@ -266,15 +263,15 @@ def plot_impulses(results: pd.DataFrame) -> Figure:
 
 
 def plot_changes(results: pd.DataFrame) -> Figure:
-    """What all other changes do: each seed, and the median."""
+    """Plot the measure under all other changes: each seed, and the median."""
     changed = results[results["disturbance"] != "impulses"]
     envs = list(changed["environment"].unique())
     figure, panels = new_panels(len(envs), 2, (5.0, 4.6), margin=(0.0, 0.3))
     for axes, env_id in zip(panels, envs, strict=True):
-        of_env = changed[changed["environment"] == env_id]
-        labels = list(dict.fromkeys(of_env["setting"]))
+        env_rows = changed[changed["environment"] == env_id]
+        labels = list(dict.fromkeys(env_rows["setting"]))
         measure, label = MEASURES[env_id]
-        for name, of_policy in of_env.groupby("policy", sort=False):
+        for name, of_policy in env_rows.groupby("policy", sort=False):
             colour, marker = STYLES[str(name)]
             axes.plot(of_policy[measure], of_policy["setting"].map(labels.index), ".", color=colour, alpha=0.35, ms=4)
             medians = of_policy.groupby("setting")[measure].median()
@@ -305,8 +302,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(str(error))
     study.configuration["disturbances"] = {env_id: DISTURBANCES[env_id] for env_id in chosen.envs}
     parts = [each | {"episodes": chosen.episodes} for each in parts]
-    made = study.run(part, parts, models=study.out / "models", compiled=chosen.compile)
-    tables = in_order(made, [*DISTURBANCES, *STYLES])
+    parts_tables = study.run(part, parts, models=study.out / "models", compiled=chosen.compile)
+    tables = in_order(parts_tables, [*DISTURBANCES, *STYLES])
     results = tables["published"]
     figures = {
         "learning": plot_learning(tables["learning"], results),

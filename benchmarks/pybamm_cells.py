@@ -146,7 +146,7 @@ def part(cell: str, seed: int) -> Tables:
             load = to_come(discharge, seen) if varies(n) else None
             for knows, own in ((FIT, None), (LIFE, before)):
                 quantiles_s = forecast_end(seen, settings, load, life=own).eod_quantile_s()
-                rows.append({**common, "knows": knows, "share": share, **_end(quantiles_s, start_s, end_s)})
+                rows.append({**common, "knows": knows, "share": share, **end_in_percent(quantiles_s, start_s, end_s)})
     there, surroundings = calibrate(life[MOVED], settings), []
     for other_C in OTHERS_C:
         (moved,) = simulated(cell, seed, [MOVED], other_C).discharges
@@ -166,17 +166,19 @@ def _moved(there: Calibration, elsewhere: Calibration) -> dict[str, float]:
     }
 
 
-def _end(quantiles_s: FloatArray, start_s: float, end_s: float) -> dict[str, float]:
+def end_in_percent(quantiles_s: FloatArray, start_s: float, end_s: float) -> dict[str, float]:
+    """How far quantiles of a forecast end lie from the measured one, in percent of the time from load-on."""
     low, middle, high = 100.0 * (quantiles_s - end_s) / (end_s - start_s)
     return {"error_percent": middle, "low_percent": low, "high_percent": high, "inside": float(low <= 0.0 <= high)}
 
 
+def over_shares(column: str, how: str) -> Cell:
+    """What a cell of a table says of a column at each share of the time."""
+    return lambda group: side_by_side(group.groupby("share")[column].agg(how).dropna())
+
+
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
     """One line a cell and what is known of it."""
-
-    def over_shares(column: str, how: str) -> Cell:
-        return lambda group: side_by_side(group.groupby("share")[column].agg(how).dropna())
-
     width = rows["high_percent"] - rows["low_percent"]
     shown = rows.assign(
         error=rows["error_percent"].abs(), width=width, cell=rows["cell"].map(CELLS), inside=100.0 * rows["inside"]

@@ -23,7 +23,7 @@ import numpy as np
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from benchmarks.control import DISTURBANCES, roll_out
-from benchmarks.runs import AT_THE_END, Run, make_rows, rows_command_line
+from benchmarks.runs import AT_THE_END, Run, control_networks, make_rows, rows_command_line
 from benchmarks.study import Study, markdown, table_of, with_interval
 
 CONTROL = list(DISTURBANCES)
@@ -31,13 +31,12 @@ BATTERIES = ["BatteryQmax-v0", "BatteryRo-v0"]
 TIMESTEPS = {**dict.fromkeys(CONTROL, 15_000), **dict.fromkeys(BATTERIES, 20_000)}
 #: The setting of control problems, which no trial chose.
 UNTUNED = {"n_envs": 4, "learning_rate": 1e-3, "gradient_steps": 2, "learning_starts": 1000, "gamma": 0.99}
-_NETWORKS = "net_arch=[64, 64], activation_fn=nn.LeakyReLU"
-#: By the name on the command line what readers call them, the class, and arguments of its policy.
-ALGORITHMS = {
-    "lac": ("LAC", "sb3_lac:LAC", ""),
-    "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC", "root=2"),
-    "lac_fourth_root": ("LAC (root=4)", "sb3_lac:LAC", "root=4"),
-    "sac": ("SAC", "stable_baselines3:SAC", ""),
+#: By the name on the command line what readers call them, the class, and the root of its critics if it is stated.
+ALGORITHMS: dict[str, tuple[str, str, int | None]] = {
+    "lac": ("LAC", "sb3_lac:LAC", None),
+    "lac_square_root": ("LAC (root=2)", "sb3_lac:LAC", 2),
+    "lac_fourth_root": ("LAC (root=4)", "sb3_lac:LAC", 4),
+    "sac": ("SAC", "stable_baselines3:SAC", None),
 }
 EPISODES, BATTERY_EPISODES, BATTERY_STEPS = 60, 30, 400
 
@@ -45,15 +44,16 @@ EPISODES, BATTERY_EPISODES, BATTERY_STEPS = 60, 30, 400
 def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -> Run:
     """A training of this study."""
     label, kind, root = ALGORITHMS[algorithm]
-    networks = [_NETWORKS, root] if task in CONTROL else [root]
-    settings: dict[str, Any] = dict(UNTUNED) if task in CONTROL else {}
-    if any(networks):
-        settings["policy_kwargs"] = f"dict({', '.join(filter(None, networks))})"
+    settings: dict[str, Any] = {}
+    if task in CONTROL:
+        settings = {**UNTUNED, "policy_kwargs": control_networks(root)}
+    elif root is not None:
+        settings = {"policy_kwargs": f"dict(root={root})"}
     return Run(task, label, kind, seed, timesteps or TIMESTEPS[task], settings)
 
 
 def percent_off(model: OffPolicyAlgorithm, task: str) -> float:
-    """How far off the parameter of held-out discharges is, in the mean, by the mean action."""
+    """Mean error of the parameter of held-out discharges with the mean action, in percent."""
     env = gym.make(task, split="test", episode_steps=BATTERY_STEPS)
     (parameter,) = env.unwrapped.task.parameters  # type: ignore[attr-defined]
     errors = []
@@ -86,9 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run_of(task, algorithm, seed, chosen.timesteps)
         for seed, task, algorithm in product(chosen.seeds, chosen.envs, chosen.algos)
     ]
-    done = make_rows(study, runs, score)
+    rows = make_rows(study, runs, score)
     cells = {"seeds": lambda group: str(len(group)), "at the end": lambda group: with_interval(group[AT_THE_END])}
-    table = table_of(done, {"task": "environment", "algorithm": "policy"}, cells)
+    table = table_of(rows, {"task": "environment", "algorithm": "policy"}, cells)
     text = "Cost per step of the mean action, of batteries by how many percent the parameter is off; interquartile mean over\n"
     text += "seeds with its 95 % interval, lower is better:\n\n"
     study.write({}, {}, text + markdown(table))

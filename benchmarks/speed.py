@@ -54,15 +54,15 @@ _SAMPLES, _PROGPY_SAMPLES, _PARTICLES_SAMPLES = 600, 20, 4
 
 
 def race(contestants: dict[str, Callable[[], int]], rounds: int, clock: Callable[[], float]) -> pd.DataFrame:
-    """How much each contestant does a second, in turns."""
+    """Measure the work of each contestant a second, in turns."""
     speeds = []
     for number in trange(rounds, desc="rounds", disable=None):
         speed = {}
         # each order as often as its reverse: nobody always comes first
         for name in list(contestants)[:: 1 if number % 2 == 0 else -1]:
             start = clock()
-            done = contestants[name]()
-            speed[name] = done / (clock() - start)
+            n_done = contestants[name]()
+            speed[name] = n_done / (clock() - start)
         speeds.append(speed)
     return pd.DataFrame(speeds)[list(contestants)]
 
@@ -108,13 +108,13 @@ def measure_updates(rounds: int) -> tuple[pd.DataFrame, str]:
     th.set_num_threads(1)
     tables, rows = [], []
     for net_arch, per_call, calls in _UPDATES:
-        ready = partial(updates_of, net_arch=net_arch, batch_size=256, per_call=per_call, calls=calls)
+        contestant = partial(updates_of, net_arch=net_arch, batch_size=256, per_call=per_call, calls=calls)
         contestants = {
-            "SAC": ready(SAC, device="cpu"),
-            "LAC": ready(LAC, device="cpu"),
-            "PublishedLAC": ready(PublishedLAC, device="cpu"),
-            "compiled LAC": ready(LAC, device="cpu", compile_update=True),
-            "SBX's SAC": ready(SBX),
+            "SAC": contestant(SAC, device="cpu"),
+            "LAC": contestant(LAC, device="cpu"),
+            "PublishedLAC": contestant(PublishedLAC, device="cpu"),
+            "compiled LAC": contestant(LAC, device="cpu", compile_update=True),
+            "SBX's SAC": contestant(SBX),
         }
         speeds = race(contestants, rounds, time.process_time)
         row: dict[str, Any] = {"networks": "-".join(map(str, net_arch)), "updates in a call": per_call}
@@ -135,12 +135,12 @@ def measure_gpu(rounds: int) -> tuple[pd.DataFrame, str]:
     th.set_num_threads(1)
     tables, rows = [], []
     for net_arch, batch_size, per_call, on_core in _ON_GPU:
-        ready = partial(updates_of, net_arch=net_arch, batch_size=batch_size, calls=1)
+        contestant = partial(updates_of, net_arch=net_arch, batch_size=batch_size, calls=1)
         contestants = {
-            "SAC": ready(SAC, per_call=per_call, device=_GPU),
-            "LAC": ready(LAC, per_call=per_call, device=_GPU),
-            "compiled LAC": ready(LAC, per_call=per_call, device=_GPU, compile_update=True),
-            "compiled LAC, one core": ready(LAC, per_call=on_core, device="cpu", compile_update=True),
+            "SAC": contestant(SAC, per_call=per_call, device=_GPU),
+            "LAC": contestant(LAC, per_call=per_call, device=_GPU),
+            "compiled LAC": contestant(LAC, per_call=per_call, device=_GPU, compile_update=True),
+            "compiled LAC, one core": contestant(LAC, per_call=on_core, device="cpu", compile_update=True),
         }
         speeds = race(contestants, rounds, time.perf_counter)
         row: dict[str, Any] = {"networks": "-".join(map(str, net_arch)), "batch": batch_size, "updates in a call": per_call}
@@ -165,8 +165,10 @@ def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
     from benchmarks.progpy_filters import ProgpyFilter  # heavy, and needed here only
     from sb3_lac.onnx import export_onnx
 
-    whole = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True)
-    record = replace(whole, voltage_V=whole.voltage_V + np.random.default_rng(0).normal(0.0, 0.005, len(whole.time_s)))
+    discharge = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True)
+    record = replace(
+        discharge, voltage_V=discharge.voltage_V + np.random.default_rng(0).normal(0.0, 0.005, len(discharge.time_s))
+    )
     samples = list(Stream.of(record.part(0, _SAMPLES), 1.0).samples())
     model = LAC("MlpPolicy", _POLICY_ENV, buffer_size=1, policy_kwargs={"net_arch": [256, 256, 256]}, device="cpu", seed=0)
 
@@ -193,14 +195,14 @@ def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
 
 
 def measure_filters(rounds: int) -> tuple[pd.DataFrame, str]:
-    """How long an update of those takes."""
+    """Measure how long an update of a calibrator takes."""
     with TemporaryDirectory() as folder:
         speeds = race(filter_contestants(Path(folder)), rounds, time.process_time)
     return speeds, report_filters(speeds)
 
 
 def report_filters(speeds: pd.DataFrame) -> str:
-    """What was measured of filters, as Markdown."""
+    """Write the measured times of calibrators as Markdown."""
     rows = []
     for name, values in speeds.items():
         ratio = speeds["progpy, unscented Kalman filter"].rdiv(values)
@@ -217,7 +219,7 @@ def report_filters(speeds: pd.DataFrame) -> str:
 
 
 def spread(values: pd.Series, digits: int) -> str:
-    """What was measured in many rounds, as readers see it."""
+    """Median and quartiles of many rounds, as readers see them."""
     low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
     return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
@@ -229,8 +231,8 @@ SECTIONS = {"updates": measure_updates, "filters": measure_filters, "gpu": measu
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("speed", __doc__, jobs=None)
-    here = [section for section in SECTIONS if section != "gpu" or _GPU]
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=here, help="what to measure")
+    sections = [section for section in SECTIONS if section != "gpu" or _GPU]
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=sections, help="what to measure")
     parser.add_argument("--rounds", type=positive, default=20, help="turns of each contestant")
     study = Study(parser, arguments)
     chosen = study.chosen

@@ -21,13 +21,12 @@ repeated, so that seeds can be added. Without algorithms only controllers are ju
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -35,7 +34,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.evaluation import over_seeds
@@ -52,7 +50,7 @@ from benchmarks.control import (
     shares_of,
     tried,
 )
-from benchmarks.runs import setting_of_lac
+from benchmarks.runs import Run, control_networks, made_by, train_or_load
 from benchmarks.study import (
     Cell,
     Study,
@@ -69,9 +67,8 @@ from benchmarks.study import (
     share_with_range,
     table_of,
     with_interval,
-    write_text,
 )
-from benchmarks.training import Recipe, record_file, train_or_load, training_minutes
+from benchmarks.zoo_runs import zoo_run
 from sb3_lac.envs import CostEnv
 from sb3_lac.stability.plots import format_log_axis
 from sb3_lac.stability.rollout import SETTLED_SHARE
@@ -82,123 +79,60 @@ class Contender:
     """
     An algorithm with settings.
 
-    :param algo: the algorithm, see :class:`Recipe`
+    :param algo: the algorithm, see :func:`benchmarks.zoo_runs.zoo_run`
     :param label: what it is called in tables and figures
-    :param colour: what it is drawn in
-    :param marker: and with
-    :param settings: whose ``default`` entry of ``zoo_configs`` it has in place of its own for each problem
-    :param hyperparameters: what differs from that
-    :param compiles: whether its updates can be compiled
-    :param typed: whether it is ``ALGO("MlpPolicy", env_id)`` as typed, with the defaults of its class in place of an entry
+    :param colour: of its curves
+    :param marker: of its curves
+    :param settings_of: whose ``default`` entry of ``zoo_configs`` it has in place of its own for each problem
+    :param differing: hyperparameters that are not those of the entry
+    :param defaults: whether it is ``ALGO("MlpPolicy", env_id)`` as typed
     """
 
     algo: str
     label: str
     colour: str
     marker: str
-    settings: str | None = None
-    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
-    compiles: bool = False
-    typed: bool = False
+    settings_of: str | None = None
+    differing: Mapping[str, Any] = field(default_factory=dict)
+    defaults: bool = False
 
-    def recipe(self, env_id: str, seed: int, timesteps: int | None) -> Recipe:
-        """What it is trained by."""
-        differing = dict(self.hyperparameters)
-        return Recipe.of(
-            self.algo, env_id, seed, timesteps, hyperparameters=differing, settings=self.settings, defaults=self.typed
-        )
-
-    def trained(self, recipe: Recipe, digest: str | None, folder: Path, compiled: bool) -> Trained:
-        """Train it, unless that has been done."""
-        if recipe.digest != digest:
-            who = f"{self.label} on {recipe.env_id}"
-            raise RuntimeError(f"the hyperparameters of {who} have changed since the study began: start it again")
-        file = record_file(recipe, folder).with_name(f"learning_{recipe.name}.csv")
-        curve = LearningCurve(recipe.env_id, recipe.timesteps, file)
-        model = train_or_load(recipe, folder, [curve], compile_update=compiled and self.compiles)
-        learning = pd.read_csv(file)
-        minutes = training_minutes(recipe, folder) - learning.pop("seconds").sum() / 60.0
-        # updates of all algorithms that learn from a replay buffer
-        return Trained(model, getattr(model, "_n_updates", None), minutes, learning)
-
-
-class Trained(NamedTuple):
-    """A policy, what its training took without what the learning curve did, and that curve."""
-
-    model: BaseAlgorithm
-    updates: int | None
-    training_minutes: float
-    learning: pd.DataFrame
+    def run(self, env_id: str, seed: int, timesteps: int | None) -> Run:
+        """Return the training."""
+        chosen = {name: getattr(self, name) for name in ("settings_of", "differing", "defaults", "label")}
+        return zoo_run(self.algo, env_id, seed, timesteps, **chosen)
 
 
 REFERENCE = "reference"
-_METRIC_SAC = "benchmarks.metric_sac:MetricSAC"
-_SQUARE_ROOT = {"policy_kwargs": setting_of_lac(root=2)["policy_kwargs"]}
-_NETWORKS = {"policy_kwargs": setting_of_lac(root=None)["policy_kwargs"]}
+_NETWORKS = {"policy_kwargs": control_networks()}
 _NOISE = {"noise_type": "normal", "noise_std": 0.1}
+_LAC, _PUBLISHED, _SAC, _TD3, _TQC = (COLOUR_OF[name] for name in ("LAC", "LAC as published", "SAC", "TD3", "TQC"))
 #: Who is judged, by the name on the command line.
 CONTENDERS = {
-    "lac": Contender("lac", "LAC", COLOUR_OF["LAC"], "o", compiles=True),
-    "lac_as_typed": Contender("lac", "LAC, as typed", COLOUR_OF["LAC"], "<", compiles=True, typed=True),
-    "lac_default_root": Contender(
-        "lac", "LAC, its default root", COLOUR_OF["LAC"], "*", hyperparameters=_NETWORKS, compiles=True
-    ),
-    "lac_square_root": Contender("lac", "LAC (root=2)", COLOUR_OF["LAC"], "d", hyperparameters=_SQUARE_ROOT, compiles=True),
-    "published_lac": Contender("published_lac", "LAC as published", COLOUR_OF["LAC as published"], "P", compiles=True),
-    "published_lac_paper": Contender(
-        "published_lac",
-        "LAC as published, its setting",
-        COLOUR_OF["LAC as published"],
-        "X",
-        settings="published_lac",
-        compiles=True,
-    ),
-    "sac": Contender("sac", "SAC", COLOUR_OF["SAC"], "s"),
-    "sac_common": Contender("sac", "SAC, LAC's setting", COLOUR_OF["SAC"], "8", settings="lac", hyperparameters=_NETWORKS),
-    "td3": Contender("td3", "TD3", COLOUR_OF["TD3"], "^"),
-    "td3_common": Contender(
-        "td3", "TD3, LAC's setting", COLOUR_OF["TD3"], ">", settings="lac", hyperparameters={**_NETWORKS, **_NOISE}
-    ),
-    "tqc": Contender("tqc", "TQC", COLOUR_OF["TQC"], "D"),
-    "tqc_common": Contender("tqc", "TQC, LAC's setting", COLOUR_OF["TQC"], "*", settings="lac", hyperparameters=_NETWORKS),
-    "metric_sac": Contender(_METRIC_SAC, "SAC, LAC's metric", COLOURS[4], "v", compiles=True),
+    "lac": Contender("lac", "LAC", _LAC, "o"),
+    "lac_as_typed": Contender("lac", "LAC, as typed", _LAC, "<", defaults=True),
+    "lac_default_root": Contender("lac", "LAC, its default root", _LAC, "*", differing=_NETWORKS),
+    "lac_square_root": Contender("lac", "LAC (root=2)", _LAC, "d", differing={"policy_kwargs": control_networks(2)}),
+    "published_lac": Contender("published_lac", "LAC as published", _PUBLISHED, "P"),
+    "published_lac_paper": Contender("published_lac", "LAC as published, its setting", _PUBLISHED, "X", "published_lac"),
+    "sac": Contender("sac", "SAC", _SAC, "s"),
+    "sac_common": Contender("sac", "SAC, LAC's setting", _SAC, "8", "lac", _NETWORKS),
+    "td3": Contender("td3", "TD3", _TD3, "^"),
+    "td3_common": Contender("td3", "TD3, LAC's setting", _TD3, ">", "lac", {**_NETWORKS, **_NOISE}),
+    "tqc": Contender("tqc", "TQC", _TQC, "D"),
+    "tqc_common": Contender("tqc", "TQC, LAC's setting", _TQC, "*", "lac", _NETWORKS),
+    "metric_sac": Contender("benchmarks.metric_sac:MetricSAC", "SAC, LAC's metric", COLOURS[4], "v"),
 }
 #: How they are drawn: colour and marker.
 STYLES = {each.label: (each.colour, each.marker) for each in CONTENDERS.values()}
 STYLES |= dict(zip({**FACTORS, **LINEAR_FACTORS}, (("black", marker) for marker in "|123x"), strict=True))
-# learning curves, whose episodes have other starts than those of all other judgements
-_POINTS, _CURVE_EPISODES, _CURVE_SEED = 12, 30, 40_000
+# episodes of learning curves, with other starts than those of all other judgements
+_CURVE_EPISODES, _CURVE_SEED = 30, 40_000
 
 
-class LearningCurve(BaseCallback):
-    """
-    Judges the mean action while a policy is trained, at evenly spaced points of which the last is the end, and writes what it
-    costs when the training has ended.
-
-    :param env_id: id of the environment
-    :param timesteps: environment steps of the training
-    :param file: table to write
-    """
-
-    def __init__(self, env_id: str, timesteps: int, file: Path) -> None:
-        super().__init__()
-        self.env_id, self.timesteps, self.file = env_id, timesteps, file
-        self.rows: list[dict[str, float]] = []
-
-    def _on_step(self) -> bool:
-        if len(self.rows) + 1 < _POINTS and self.num_timesteps >= self.timesteps * (len(self.rows) + 1) / _POINTS:
-            self._judge()
-        return True
-
-    def _on_training_end(self) -> None:
-        self._judge()
-        write_text(self.file, pd.DataFrame(self.rows).to_csv(index=False))
-
-    def _judge(self) -> None:
-        start = time.perf_counter()
-        judged = {"timesteps": self.model.num_timesteps, "updates": getattr(self.model, "_n_updates", np.nan)}
-        judged |= _cost_of(self.model, self.env_id)
-        self.rows.append(judged | {"seconds": time.perf_counter() - start})
+def while_training(model: BaseAlgorithm, run: Run) -> dict[str, float]:
+    """A point of a learning curve: what the mean action costs."""
+    updates = getattr(model, "_n_updates", np.nan)
+    return {"timesteps": model.num_timesteps, "updates": updates, **_cost_of(model, run.task)}
 
 
 def _cost_of(policy: PolicyPredictor, env_id: str) -> dict[str, float]:
@@ -208,12 +142,20 @@ def _cost_of(policy: PolicyPredictor, env_id: str) -> dict[str, float]:
     return {"cost": outcome["cost"].mean(), "at_goal": shares_of(outcome, problem.error_tolerance)["at_goal"]}
 
 
+def trained(run: Run, models: Path, compiled: bool) -> tuple[BaseAlgorithm, dict[str, Any], pd.DataFrame]:
+    """Train a policy, unless that has been done: the model, what its training took, and its learning curve."""
+    folder = models / run.name
+    model = train_or_load(run, folder, while_training, compiled=compiled)
+    record = made_by(run, folder)
+    took = {name: record[name] for name in ("timesteps", "updates", "training_minutes")}
+    return model, took, pd.DataFrame(record["curve"])
+
+
 def part(
     policy: str,
     env_id: str,
     seed: int | None,
-    timesteps: int | None,
-    recipe: str | None,
+    run: dict[str, Any] | None,
     episodes: int,
     certificate_episodes: int,
     models: Path,
@@ -221,22 +163,16 @@ def part(
 ) -> Tables:
     """Train a policy, or take a controller, and judge it."""
     predictor: PolicyPredictor
-    if seed is None:
-        predictor, updates, minutes = controllers(env_id)[policy], None, None
+    if run is None:
+        predictor, label, recipe = controllers(env_id)[policy], policy, None
+        took: dict[str, Any] = dict.fromkeys(("timesteps", "updates", "training_minutes"))
         learning = pd.DataFrame([{"timesteps": np.nan, "updates": np.nan, **_cost_of(predictor, env_id)}])
     else:
-        chosen, folder = CONTENDERS[policy], models / f"{env_id}_{policy}_seed{seed}"
-        made_from = chosen.recipe(env_id, seed, timesteps)
-        predictor, updates, minutes, learning = chosen.trained(made_from, recipe, folder, compiled)
-    label = policy if seed is None else CONTENDERS[policy].label
+        made_from = Run(**run)
+        predictor, took, learning = trained(made_from, models, compiled)
+        label, recipe = made_from.algorithm, made_from.digest
     of_policy = {"environment": env_id, "policy": label, "seed": seed}
-    described: dict[str, Any] = {
-        **of_policy,
-        "timesteps": timesteps,
-        "updates": updates,
-        "training_minutes": minutes,
-        "recipe": recipe,
-    }
+    described = {**of_policy, **took, "recipe": recipe}
     return {
         "stabilisation": _beside(described, tried(predictor, env_id, episodes)),
         "certificates": _beside(described, judge(predictor, env_id, certificate_episodes)),
@@ -256,14 +192,11 @@ def parts_of(
 ) -> list[dict[str, Any]]:
     """The controllers of each environment, then seed by seed each policy, so that an interrupted study has whole seeds."""
     parts: list[dict[str, Any]] = [
-        {"policy": name, "env_id": env_id, "seed": None, "timesteps": None, "recipe": None}
-        for env_id in chosen.envs
-        for name in untrained(env_id)
+        {"policy": name, "env_id": env_id, "seed": None, "run": None} for env_id in chosen.envs for name in untrained(env_id)
     ]
     for seed, env_id, policy in product(chosen.seeds, chosen.envs, chosen.algos):
-        recipe = contender(policy, env_id).recipe(env_id, seed, timesteps(env_id))
-        made_from = {"seed": seed, "timesteps": recipe.timesteps, "recipe": recipe.digest}
-        parts.append({"policy": policy, "env_id": env_id, **made_from})
+        run = contender(policy, env_id).run(env_id, seed, timesteps(env_id))
+        parts.append({"policy": policy, "env_id": env_id, "seed": seed, "run": asdict(run)})
     return parts
 
 
@@ -278,7 +211,7 @@ def in_order(tables: Tables, order: Sequence[str]) -> dict[str, pd.DataFrame]:
 
 
 def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
-    """What policies cost and where they end, without disturbances."""
+    """Tabulate costs and final errors of policies without disturbances."""
     cells: dict[str, Cell] = {
         "seeds": of_trained(lambda group: str(len(group))),
         "updates": of_trained(lambda group: f"{group['updates'].max():.0f}"),
@@ -292,13 +225,15 @@ def undisturbed_table(results: pd.DataFrame) -> pd.DataFrame:
 
 
 def undisturbed_text(results: pd.DataFrame) -> list[str]:
-    """The same, as Markdown below what its numbers are."""
-    said = "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of episodes "
-    return [f"{said}are means (least to most of a seed):\n", markdown(undisturbed_table(results))]
+    """Write this table as Markdown, below a caption."""
+    caption = (
+        "Without disturbances. Costs and errors are interquartile means over seeds with 95 % intervals, shares of episodes "
+    )
+    return [f"{caption}are means (least to most of a seed):\n", markdown(undisturbed_table(results))]
 
 
 def disturbed_table(results: pd.DataFrame, cell: Callable[[pd.DataFrame], str]) -> pd.DataFrame:
-    """What each disturbance does, as one cell says of all tries of a policy."""
+    """Tabulate each disturbance, with one cell for all tries of a policy."""
     conditions = results["disturbance"].unique()
     cells = {name: lambda tries, name=name: cell(tries[tries["disturbance"] == name]) for name in conditions}
     return table_of(results, ["environment", "policy"], cells)
@@ -315,27 +250,27 @@ def ends_of(tries: pd.DataFrame) -> str:
 
 
 def certificate_table(certificates: pd.DataFrame) -> pd.DataFrame:
-    """What the certificates say."""
+    """Tabulate the certificates."""
 
-    def known(values: pd.Series) -> str:
+    def interval_or_dash(values: pd.Series) -> str:
         return with_interval(values.dropna()) if values.notna().any() else "-"
 
     of_critics = certificates["function"] == "critic"
-    shown = certificates.assign(policy=certificates["policy"] + np.where(of_critics, " (critic)", ""))
+    labelled = certificates.assign(policy=certificates["policy"] + np.where(of_critics, " (critic)", ""))
     for column in ("cost_bound", "cost_bound_alpha3"):
-        shown[f"held_{column}"] = shown[column].where(shown["holds"])
+        labelled[f"held_{column}"] = labelled[column].where(labelled["holds"])
     cells: dict[str, Cell] = {
         "holds": ("holds", count_of),
         f"settles at {SETTLED_SHARE:g} of the start": ("settles", count_of),
         "cost at the start": ("start_cost", lambda costs: digits(costs.mean())),
-        "where it holds: mean cost settles below": ("held_cost_bound", known),
-        "its alpha3": ("held_cost_bound_alpha3", known),
+        "where it holds: mean cost settles below": ("held_cost_bound", interval_or_dash),
+        "its alpha3": ("held_cost_bound_alpha3", interval_or_dash),
         "alpha3 without residual": ("largest_feasible_alpha3", with_interval),
-        "cost-to-go by L, slope": ("calibration_slope", known),
+        "cost-to-go by L, slope": ("calibration_slope", interval_or_dash),
         # stated once for a policy, with the fitted function
         "survives, at least": ("survives_at_least", lambda shares: digits(shares.mean())),
     }
-    return table_of(shown, ["environment", "policy"], cells)
+    return table_of(labelled, ["environment", "policy"], cells)
 
 
 def report(tables: Tables) -> str:
@@ -362,9 +297,9 @@ def plot_learning(learning: pd.DataFrame) -> Figure:
     envs = list(learning["environment"].unique())
     figure, panels = new_panels(len(envs), 3, (3.1, 2.3), margin=(0.0, 0.4))
     for axes, env_id in zip(panels, envs, strict=True):
-        of_env = learning[learning["environment"] == env_id]
+        env_rows = learning[learning["environment"] == env_id]
         for name, (colour, marker) in STYLES.items():
-            of_policy = of_env[of_env["policy"] == name]
+            of_policy = env_rows[env_rows["policy"] == name]
             if len(of_policy) and of_policy["seed"].isna().all():
                 axes.axhline(float(of_policy["cost"].iloc[0]), color=colour, ls="--", lw=1.0, label=name)
             elif not of_policy.empty:
@@ -407,8 +342,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ValueError as error:
         parser.error(str(error))
     study.configuration["disturbances"] = {env_id: conditions(env_id) for env_id in chosen.envs}
-    made = study.run(part, [each | judged for each in parts], models=study.out / "models", compiled=chosen.compile)
-    tables = in_order(made, [*DISTURBANCES, *STYLES])
+    parts_tables = study.run(part, [each | judged for each in parts], models=study.out / "models", compiled=chosen.compile)
+    tables = in_order(parts_tables, [*DISTURBANCES, *STYLES])
     study.write(tables, {"learning": plot_learning(tables["learning"])}, report(tables))
 
 

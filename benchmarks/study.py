@@ -6,6 +6,7 @@ and numbers as readers see them. A study itself keeps its configuration, the fun
 from __future__ import annotations
 
 import argparse
+import gzip
 import importlib
 import inspect
 import json
@@ -43,6 +44,8 @@ Tables = Mapping[str, pd.DataFrame]
 SYMBOLS = {"q_mobile": "q_max", "r_o": "R_o"}
 #: Seed of evaluations; no training seed comes close.
 EVALUATION_SEED = 10_000
+#: Larger tables are packed with gzip.
+LARGEST_PLAIN_TABLE_BYTES = 100_000
 
 _PACKAGES = (
     *("torch", "stable_baselines3", "sb3_contrib", "gymnasium", "mujoco"),
@@ -57,7 +60,7 @@ def own_versions() -> dict[str, str]:
 
 def versions() -> dict[str, str]:
     """The versions that a result depends on."""
-    found = {
+    by_package = {
         **own_versions(),
         "python": platform.python_version(),
         "system": platform.platform(),
@@ -65,10 +68,10 @@ def versions() -> dict[str, str]:
     }
     for package in _PACKAGES:
         try:
-            found[package] = version(package)
+            by_package[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return by_package
 
 
 def write_text(path: Path, text: str) -> None:
@@ -84,6 +87,32 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else str(value)
+
+
+def table_file(folder: Path, name: str) -> Path:
+    """The file of a table, ``NAME.csv.gz`` if that is there and ``NAME.csv`` otherwise; ``pandas.read_csv`` reads both."""
+    packed = folder / f"{name}.csv.gz"
+    return packed if packed.exists() else folder / f"{name}.csv"
+
+
+def read_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """All tables of a folder, by name."""
+    names = sorted({path.name.partition(".csv")[0] for path in folder.glob("*.csv*")})
+    return {name: pd.read_csv(table_file(folder, name)) for name in names}
+
+
+def write_csv(folder: Path, name: str, text: str) -> None:
+    """Write the text of a table in place of what it was before: packed if it is large, with equal bytes for equal text."""
+    packed, plain = folder / f"{name}.csv.gz", folder / f"{name}.csv"
+    content = text.encode()
+    file, other = (packed, plain) if len(content) > LARGEST_PLAIN_TABLE_BYTES else (plain, packed)
+    with replacing(file) as part, part.open("wb") as stream:
+        if file is packed:
+            with gzip.GzipFile("", "wb", fileobj=stream, mtime=0) as compressed:
+                compressed.write(content)
+        else:
+            stream.write(content)
+    other.unlink(missing_ok=True)
 
 
 def digest_of(content: Mapping[str, Any]) -> str:
@@ -110,9 +139,9 @@ def new_panels(
 def add_legend(figure: Figure, panels: Iterable[Axes], columns: int, order: Iterable[str] | None = None) -> None:
     """A legend below all panels, with one entry for each name that any of them has."""
     handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    shown = list(handles) if order is None else [name for name in order if name in handles]
-    entries = [handles[name] for name in shown]
-    figure.legend(entries, shown, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
+    labels = list(handles) if order is None else [name for name in order if name in handles]
+    entries = [handles[name] for name in labels]
+    figure.legend(entries, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
 
 
 def digits(value: float, significant: int = 2) -> str:
@@ -149,12 +178,12 @@ def share_with_range(values: pd.Series) -> str:
 
 
 def share_in_percent(values: pd.Series) -> str:
-    """Which share of them is true."""
+    """Share that is true, in percent."""
     return f"{100 * values.mean():.0f}"
 
 
 def count_of(values: pd.Series) -> str:
-    """How many of a few are true."""
+    """Number of a few that are true."""
     return f"{values.sum()} of {len(values)}"
 
 
@@ -182,26 +211,26 @@ def table_of(rows: pd.DataFrame, by: Sequence[str] | Mapping[str, str], cells: M
     """
     titles = by if isinstance(by, Mapping) else dict(zip(by, by, strict=True))
     groups = rows.groupby(list(titles), sort=False, dropna=False)
-    return pd.DataFrame([dict(zip(titles.values(), keys, strict=True)) | _said(cells, group) for keys, group in groups])
+    return pd.DataFrame([dict(zip(titles.values(), keys, strict=True)) | _cells_of(cells, group) for keys, group in groups])
 
 
 def row_by_row(rows: pd.DataFrame, cells: Mapping[str, Cell]) -> pd.DataFrame:
     """A table with what is said of each row, by title."""
-    return pd.DataFrame([_said(cells, row) for row in rows.to_dict("records")])
+    return pd.DataFrame([_cells_of(cells, row) for row in rows.to_dict("records")])
 
 
-def _said(cells: Mapping[str, Cell], of: Any) -> dict[str, Any]:
-    def said(cell: Cell) -> Any:
+def _cells_of(cells: Mapping[str, Cell], of: Any) -> dict[str, Any]:
+    def cell_of(cell: Cell) -> Any:
         if isinstance(cell, str):
             return cell.format_map(of)
         return cell[1](of[cell[0]]) if isinstance(cell, tuple) else cell(of)
 
-    return {title: said(cell) for title, cell in cells.items()}
+    return {title: cell_of(cell) for title, cell in cells.items()}
 
 
-def of_trained(said: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
+def of_trained(cell: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
     """A cell that says nothing of rows without a seed, as of a calibrator or a controller that nobody trained."""
-    return lambda group: "" if group["seed"].isna().all() else said(group)
+    return lambda group: "" if group["seed"].isna().all() else cell(group)
 
 
 def natural(text: str) -> int:
@@ -248,8 +277,8 @@ def run_named(
 
 def command_line(name: str, document: str | None, jobs: int | None = 2) -> argparse.ArgumentParser:
     """
-    What the command lines of all studies have in common: ``--jobs``, ``--scheduler``, ``--redraw`` and ``--out``. The name is
-    that of the module, and of the study if the module has several.
+    Make the command line of a study, with what all have in common: ``--jobs``, ``--scheduler``, ``--redraw`` and ``--out``.
+    The name is that of the module, and of the study if the module has several.
     """
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks.{name}", description=document, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -294,7 +323,7 @@ class Study:
         if self.scheduler is not None:
             self.out = self.out.absolute()  # workers are elsewhere
             try:
-                with workers(scheduler=self.scheduler):
+                with workers(1, self.scheduler):
                     pass
             except (ImportError, OSError) as error:
                 parser.error(str(error))
@@ -306,7 +335,7 @@ class Study:
         to keep itself. To redraw, no part is made: the tables are those that are written.
         """
         if self.redraws:
-            written = {file.stem: pd.read_csv(file) for file in sorted(self.out.glob("*.csv"))}
+            written = read_tables(self.out)
             # a text that is empty comes back as one
             texts = {name: table.select_dtypes(exclude=["number", "bool"]).columns for name, table in written.items()}
             return {name: table.fillna(dict.fromkeys(texts[name], "")) for name, table in written.items()}
@@ -315,16 +344,18 @@ class Study:
         where = list(missing)
         runs = [(partial(importable(part), **places), arguments) for arguments in missing.values()]
         self.each(_make, runs, lambda number, content: write_json(where[number], content))
-        made = [_tables_of(recall(file)) for file in files]
-        names = dict.fromkeys(name for tables in made for name in tables)
-        return {name: pd.concat([tables[name] for tables in made if name in tables], ignore_index=True) for name in names}
+        made_tables = [_tables_of(recall(file)) for file in files]
+        names = dict.fromkeys(name for tables in made_tables for name in tables)
+        return {
+            name: pd.concat([tables[name] for tables in made_tables if name in tables], ignore_index=True) for name in names
+        }
 
     def done(self, part: Callable[..., Tables]) -> list[tuple[dict[str, Any], Tables]]:
         """The arguments and the tables of all parts that lie in ``<out>/parts``, whichever command made them."""
-        kept = {file: recall(file) for file in sorted((self.out / "parts").glob(f"{part.__name__}_*.json"))}
+        records = {file: recall(file) for file in sorted((self.out / "parts").glob(f"{part.__name__}_*.json"))}
         return [
             (content["arguments"], _tables_of(content))
-            for file, content in kept.items()
+            for file, content in records.items()
             if content and file == self._file_of(part, content["arguments"])  # not of another version
         ]
 
@@ -379,12 +410,12 @@ class Study:
                     yield started[future], future.result
 
     def write_table(self, name: str, table: pd.DataFrame, configuration: Mapping[str, Any] | None = None) -> None:
-        """Write a table as CSV, and beside it as JSON what made it: command, configuration, versions."""
+        """Write a table, and beside it as JSON what made it: command, configuration, versions."""
         configuration = self.configuration if configuration is None else configuration
         write_json(
             self.out / f"{name}.json", {"command": self.command, "configuration": configuration, "versions": versions()}
         )
-        write_text(self.out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
+        write_csv(self.out, name, table.to_csv(index=False, float_format="%.6g"))
 
     def write(self, tables: Tables, figures: Mapping[str, Figure], text: str, name: str | None = None) -> None:
         """Write what came out, and show the text."""
@@ -406,8 +437,8 @@ def importable(function: Callable[..., Result]) -> Callable[..., Result]:
 
 def recall(file: Path) -> dict[str, Any] | None:
     """
-    What a file says of something that is done, which is written last; None if there is none. A damaged one is set aside, and
-    what it stood for is made again.
+    Read the file that is written last of something that is done; None if there is none. A damaged file is set aside, and its
+    content is made again.
     """
     if not file.exists():
         return None

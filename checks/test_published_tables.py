@@ -3,15 +3,8 @@
 import json
 from functools import partial
 
-import pandas as pd
-
-from benchmarks import (
-    calibrators,
-    direct_mapping,
-    published,
-    speed,
-    stabilisation,
-)
+from benchmarks import calibrators, direct_mapping, other_cells, published, speed, stabilisation
+from benchmarks.study import read_tables
 from checks.pages import DOCS
 
 PUBLISHED = DOCS / "results"
@@ -36,6 +29,7 @@ def of_mapping(tables):
 
 REPORTS = {
     "direct_mapping/direct_mapping": of_mapping,
+    "other_cells/other_cells": partial(of_one, other_cells.report, "other_cells"),
     "published/published": partial(of_one, published.report, "published"),
     "published_horizons/published": partial(of_one, published.report, "published"),
     "stabilisation/stabilisation": stabilisation.report,
@@ -47,6 +41,6 @@ REPORTS = {
 
 def test_what_is_shown_is_what_the_reports_say_of_the_published_tables():
     for name, report in REPORTS.items():
-        tables = {path.stem: pd.read_csv(path) for path in (PUBLISHED / name).parent.glob("*.csv")}
+        tables = read_tables((PUBLISHED / name).parent)
         shown = (PUBLISHED / f"{name}.md").read_text(encoding="utf-8")
         assert report(tables) == shown, f"{name}: run the study with --redraw"

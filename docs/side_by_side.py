@@ -22,8 +22,9 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from battery_env.plotting import COLOUR_OF
 from benchmarks import control
+from benchmarks.runs import train_or_load
 from benchmarks.study import EVALUATION_SEED
-from benchmarks.training import Recipe, train_or_load
+from benchmarks.zoo_runs import zoo_run
 from docs.environment_pictures import EPISODES, PICTURES, in_few_colours, save_moving
 
 ENV, START = "VehicleCost-v0", EPISODES["VehicleCost-v0"].start
@@ -89,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     models = parser.parse_args(arguments).models
     halves, errors_m = [], {}
     for algo in ("lac", "sac"):
-        policy = train_or_load(Recipe.of(algo, ENV, SEED, TIMESTEPS), models)
+        policy = train_or_load(zoo_run(algo, ENV, SEED, TIMESTEPS), models)
         error_m = control.roll_out(policy, lambda: gym.make(ENV), EPISODES_BESIDE, EVALUATION_SEED)["error"]
         print(f"{algo.upper()}: {error_m.median():.2g} m off at the end, median of {EPISODES_BESIDE} starts")
         pictures, errors_m[algo.upper()] = episode(policy, algo.upper())

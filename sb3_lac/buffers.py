@@ -29,7 +29,7 @@ class Samples(NamedTuple):
 
     @classmethod
     def of(cls, sampled: Any) -> "Samples":
-        """What there is of it in any object that has these names. It may have others, of any type."""
+        """Take these fields from any object that has some of them. It may have other fields, of any type."""
         values: dict[str, Any] = {name: getattr(sampled, name) for name in cls._fields if name not in cls._field_defaults}
         values |= {name: getattr(sampled, name, None) for name in cls._field_defaults}
         return cls(**values)

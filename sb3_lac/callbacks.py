@@ -133,8 +133,8 @@ class LyapunovCallback(EventCallback):
         values: dict[str, float] = {}
         for metric in self.METRICS:
             name = metric.removeprefix("largest_")
-            found = (np.nan,) * 3 if self.last_report is None else self.last_report.metrics[metric]
-            values.update(zip((name, f"{name}_low", f"{name}_high"), found, strict=True))
+            interval = (np.nan,) * 3 if self.last_report is None else self.last_report.metrics[metric]
+            values.update(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
         return values
 
     def _figures(self) -> dict[str, MatplotlibFigure]:
@@ -203,11 +203,11 @@ class CertificateCallback(LyapunovCallback):
 
     def _values(self) -> dict[str, float]:
         # NaN for a statement that no episode could make
-        holds, made = np.nan, dict.fromkeys(self.STATEMENTS, np.nan)
+        holds, at_least = np.nan, dict.fromkeys(self.STATEMENTS, np.nan)
         if self.last_report is not None and self.last_certification is not None:
             holds = float(self.last_report.holds)
-            made.update(self.last_certification.statements["at_least"])
-        statements = {f"{statement}_at_least": float(made[statement]) for statement in self.STATEMENTS}
+            at_least.update(self.last_certification.statements["at_least"])
+        statements = {f"{statement}_at_least": float(at_least[statement]) for statement in self.STATEMENTS}
         return {"holds": holds, **statements, **super()._values()}
 
     def _figures(self) -> dict[str, MatplotlibFigure]:

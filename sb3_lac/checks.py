@@ -82,7 +82,7 @@ def refuse_what_spoils_weights(name: str, value: Any, step: int, vec_normalize: 
 
 
 def refuse_samples(replay_data: Samples, step: int, check_observations: bool) -> None:
-    """The same for samples: rewards may be computed only then (HER), and a buffer may have been filled elsewhere."""
+    """Refuse such samples: rewards may be computed only then (HER), and a buffer may have been filled elsewhere."""
     names = ("actions", "rewards", "observations", "next_observations") if check_observations else ("actions", "rewards")
     named = [(name, getattr(replay_data, name)) for name in names]
     parts = [(name, part) for name, each in named for part in (each.values() if isinstance(each, dict) else [each])]
@@ -98,7 +98,7 @@ def spaces_of(replay_buffer: Any) -> list[spaces.Space]:
 
 
 def form_of(space: spaces.Space) -> Any:
-    """What arrays of a space have in common: whatever their limits, those of a box have one shape and one kind of numbers."""
+    """Return what all arrays of a space share: whatever its limits, those of a box have one shape and one kind of numbers."""
     if isinstance(space, spaces.Dict):
         return {name: form_of(part) for name, part in space.spaces.items()}
     return (space.shape, space.dtype.kind) if isinstance(space, spaces.Box) else space
@@ -111,16 +111,16 @@ def warn_of_free_terminations(replay_buffer: ReplayBuffer | None, n_costs: float
         return
     # From the oldest step on
     stored = (np.arange(replay_buffer.size()) + (replay_buffer.pos if replay_buffer.full else 0)) % replay_buffer.buffer_size
-    costs, done = 0.0 - replay_buffer.rewards[stored], replay_buffer.dones[stored] > 0
-    ends = done & (replay_buffer.timeouts[stored] == 0)
+    costs, dones = 0.0 - replay_buffer.rewards[stored], replay_buffer.dones[stored] > 0
+    ends = dones & (replay_buffer.timeouts[stored] == 0)
     if not ends.any() or ends.all():
         return
-    others, last = costs[~ends], costs[ends].mean()
-    price = others.mean() * n_costs
+    running, last = costs[~ends], costs[ends].mean()
+    price = running.mean() * n_costs
     # An end that costs less than any other step is a goal
-    if others.min() <= last <= others.max() and price > 0:
+    if running.min() <= last <= running.max() and price > 0:
         # Of a buffer that is full the first episodes have lost their first steps
-        lengths = [np.diff(np.flatnonzero(column), prepend=-1)[int(replay_buffer.full) :] for column in done.T]
+        lengths = [np.diff(np.flatnonzero(column), prepend=-1)[int(replay_buffer.full) :] for column in dones.T]
         advice = advice_for_a_time_limit(np.concatenate(lengths)) or (
             "Where the end is the goal, all is well. Where it is a failure, to fail early is the cheapest policy of any "
             "algorithm: give the last step a cost of its own, above that of going on, here about "
@@ -128,7 +128,7 @@ def warn_of_free_terminations(replay_buffer: ReplayBuffer | None, n_costs: float
         )
         warnings.warn(
             f"The last step before a termination costs {last:.3g} on average, no more than another step does (up to "
-            f"{others.max():.3g}). {advice}",
+            f"{running.max():.3g}). {advice}",
             stacklevel=3,
         )
 

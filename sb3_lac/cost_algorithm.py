@@ -164,9 +164,11 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
     def _adopt_replay_buffer(self) -> None:
         """Let the replay buffer sample as the model says, or refuse it."""
-        for own, other in zip(self._stored_spaces, spaces_of(self.replay_buffer), strict=False):
-            if form_of(own) != form_of(other):
-                raise ValueError(f"The replay buffer is of another environment: it stores {other}, and the model needs {own}.")
+        for own, buffer_space in zip(self._stored_spaces, spaces_of(self.replay_buffer), strict=False):
+            if form_of(own) != form_of(buffer_space):
+                raise ValueError(
+                    f"The replay buffer is of another environment: it stores {buffer_space}, and the model needs {own}."
+                )
         if isinstance(self.replay_buffer, NStepReplayBuffer):
             if self.gamma == 1:
                 raise ValueError(f"gamma={self.gamma} must be smaller than 1 with n-step returns, for instance 0.99.")
@@ -188,7 +190,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
 
     @property
     def n_costs(self) -> float:
-        """What ``L`` is where each step costs 1, infinite without a discount."""
+        """Return ``L`` of a cost of 1 at each step, infinite without a discount."""
         return 1 / (1 - self.gamma) if self.gamma < 1 else math.inf
 
     def bound_in(self, vec_normalize: VecNormalize | None) -> RewardBound:
@@ -236,25 +238,25 @@ class CostAlgorithm(OffPolicyAlgorithm):
     ) -> None:
         vec_normalize = self._vec_normalize_env
         # What the environments said, before any normalization
-        said, paid = new_obs, reward
+        observation, raw_reward = new_obs, reward
         if vec_normalize is not None:
-            said, paid = vec_normalize.get_original_obs(), vec_normalize.get_original_reward()
+            observation, raw_reward = vec_normalize.get_original_obs(), vec_normalize.get_original_reward()
         # An environment may pay a list
-        paid = np.asarray(paid)
+        raw_reward = np.asarray(raw_reward)
         refuse_what_spoils_weights("policy gave the action", buffer_action, self.num_timesteps)
-        refuse_what_spoils_weights("environment gave the reward", paid, self.num_timesteps, vec_normalize)
-        self._refuse_observation("observation", said)
+        refuse_what_spoils_weights("environment gave the reward", raw_reward, self.num_timesteps, vec_normalize)
+        self._refuse_observation("observation", observation)
         for index in np.flatnonzero(dones):
             self._refuse_observation("last observation", infos[index].get("terminal_observation"))
         # The largest reward of a step, which n-step returns do not tell
-        if paid.max() > 0 and paid.max() > self.largest_reward:
+        if raw_reward.max() > 0 and raw_reward.max() > self.largest_reward:
             if self.n_costs == math.inf and self.largest_reward == 0:
                 warnings.warn(
-                    f"With gamma=1 and rewards up to {paid.max():g}, L is infinite: it is learned up to that constant, and "
-                    "shown as infinite. Use for instance gamma=0.99.",
+                    f"With gamma=1 and rewards up to {raw_reward.max():g}, L is infinite: it is learned up to that constant, "
+                    "and shown as infinite. Use for instance gamma=0.99.",
                     stacklevel=2,
                 )
-            self.bound_in(vec_normalize).raise_to(float(paid.max()))
+            self.bound_in(vec_normalize).raise_to(float(raw_reward.max()))
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def costs(self, replay_data: Samples) -> th.Tensor:
@@ -279,14 +281,14 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return th.exp(self.log_lambda.detach()), ent_coef
 
     def _parameters_of(self, network: BaseModel) -> list[th.Tensor]:
-        """What a network learns by: what its optimizer holds, and what none does, as an encoder that somebody else steps."""
+        """Return what a network learns: parameters of its optimizer, and those of none, as of an encoder stepped elsewhere."""
         critic, actor = (
-            [parameter for group in each.optimizer.param_groups for parameter in group["params"]]
-            for each in (self.critic, self.actor)
+            [parameter for group in part.optimizer.param_groups for parameter in group["params"]]
+            for part in (self.critic, self.actor)
         )
-        held = {id(parameter) for parameter in (*critic, *actor)}
-        others = [parameter for parameter in network.parameters() if id(parameter) not in held]
-        return [*(critic if network is self.critic else actor), *others]
+        optimized = {id(parameter) for parameter in (*critic, *actor)}
+        unoptimized = [parameter for parameter in network.parameters() if id(parameter) not in optimized]
+        return [*(critic if network is self.critic else actor), *unoptimized]
 
     def _update_multipliers(self, violation: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
         """Optimize the multipliers of the decrease condition and of the entropy, and tell their losses."""
@@ -338,8 +340,8 @@ class CostAlgorithm(OffPolicyAlgorithm):
         names: tuple[str, ...] = ()
         metrics_per_step: list[th.Tensor] = []
 
-        ready = nullcontext(self._update) if self._compiled is None else self._compiled.ready(self, optimizers)
-        with same_distributions(self), ready as update:
+        compiled = nullcontext(self._update) if self._compiled is None else self._compiled.traceable(self, optimizers)
+        with same_distributions(self), compiled as update:
             for gradient_step, (replay_data, costs) in enumerate(self._batches(gradient_steps, batch_size)):
                 update_targets = (self._n_updates + gradient_step) % self.target_update_interval == 0
                 names, metrics = update(replay_data, costs, update_targets)
@@ -374,11 +376,11 @@ class CostAlgorithm(OffPolicyAlgorithm):
         )
 
     def save(self, path: Any, *args: Any, **kwargs: Any) -> None:
-        with whole(path, ".zip") as part:
+        with saved_file(path, ".zip") as part:
             super().save(part, *args, **kwargs)
 
     def save_replay_buffer(self, path: Any) -> None:
-        with whole(path, ".pkl") as part:
+        with saved_file(path, ".pkl") as part:
             super().save_replay_buffer(part)
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
@@ -432,8 +434,8 @@ def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, 
     return loss.detach()
 
 
-def whole(path: Any, suffix: str) -> AbstractContextManager[Any]:
-    """What Stable-Baselines3 writes to: a file that is there stays until the new one is whole."""
+def saved_file(path: Any, suffix: str) -> AbstractContextManager[Any]:
+    """Open what Stable-Baselines3 writes to: a file that is there stays until the new one is complete."""
     if not isinstance(path, (str, os.PathLike)):
         return nullcontext(path)
     path = Path(path)

@@ -65,19 +65,19 @@ def hyperparameters_of(model: BaseAlgorithm) -> dict[str, bool | str | float]:
     values |= {name: _plain(getattr(model, name, None)) for name in sorted(names)}
     if "net_arch" in model.policy_kwargs:
         values["net_arch"] = str(model.policy_kwargs["net_arch"])
-    found: dict[str, bool | str | float] = {}
+    hyperparameters: dict[str, bool | str | float] = {}
     for name, value in values.items():
         if name in _NOT_LEARNING:
             continue
         if isinstance(value, ConstantSchedule):
-            found[name] = value.val
+            hyperparameters[name] = value.val
         elif isinstance(value, TrainFreq):
-            found[name] = f"{value.frequency} {value.unit.value}"
+            hyperparameters[name] = f"{value.frequency} {value.unit.value}"
         elif isinstance(value, (bool, int, float, str)):
-            found[name] = value
+            hyperparameters[name] = value
         elif name.endswith("learning_rate") and callable(value):
-            found[name] = getattr(value, "__name__", repr(value))
-    return found
+            hyperparameters[name] = getattr(value, "__name__", repr(value))
+    return hyperparameters
 
 
 class _LogarithmOfCosts(KVWriter):
@@ -149,9 +149,9 @@ class DashboardCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         # not every algorithm hands over what the environment said (ARS does not)
-        said = [_plain(info.get("cost")) for info in self.locals.get("infos", ())]
+        logged = [_plain(info.get("cost")) for info in self.locals.get("infos", ())]
         # Environments of others use that key for other things, too
-        costs = [float(cost) for cost in said if isinstance(cost, (int, float)) and abs(cost) <= sys.float_info.max]
+        costs = [float(cost) for cost in logged if isinstance(cost, (int, float)) and abs(cost) <= sys.float_info.max]
         if costs:
             self.logger.record_mean("rollout/cost_mean", float(np.mean(costs)))
         return True

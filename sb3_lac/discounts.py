@@ -13,7 +13,7 @@ def stated_discount(env: VecEnv | None) -> float:
     # There may be no environment, and a vector environment of somebody else may have no attributes
     with suppress(AttributeError, NotImplementedError):
         metadata = env.get_attr("metadata")  # type: ignore[union-attr]
-    stated = [(of_env or {}).get("discount", DEFAULT_DISCOUNT) for of_env in metadata] or [DEFAULT_DISCOUNT]
+    stated = [(each or {}).get("discount", DEFAULT_DISCOUNT) for each in metadata] or [DEFAULT_DISCOUNT]
     if any(discount != stated[0] for discount in stated):
         raise ValueError(f"The environments state different discounts, {stated}: set gamma.")
     return stated[0]

@@ -198,7 +198,7 @@ class LAC(CostAlgorithm):
             self._setup_model()
 
     def _target_values(self, replay_data: Any, next_actions: th.Tensor) -> th.Tensor:
-        """What the critic learns the root of: values of ``L``, relative to its offset."""
+        """Return the targets whose root the critic learns: values of ``L``, relative to its offset."""
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         with th.no_grad():
@@ -211,7 +211,7 @@ class LAC(CostAlgorithm):
             return -replay_data.rewards + (1 - replay_data.dones) * discounts * next_values
 
     def _objective(self, roots: th.Tensor) -> th.Tensor:
-        """What the actor lowers, given the roots at its actions."""
+        """Return the loss of the actor, given the roots at its actions."""
         return self.critic.distance(roots).mean()
 
     def _update(self, replay_data: Samples, costs: th.Tensor, update_targets: bool) -> Metrics:

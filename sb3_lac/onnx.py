@@ -150,8 +150,8 @@ def export_onnx(
     models = list(model) if isinstance(model, Sequence) else [model]
     policies = [each if isinstance(each, BasePolicy) else each.policy for each in models]
     model, policy = models[0], policies[0]
-    for other in policies[1:]:
-        if (other.observation_space, other.action_space) != (policy.observation_space, policy.action_space):
+    for member in policies[1:]:
+        if (member.observation_space, member.action_space) != (policy.observation_space, policy.action_space):
             raise ValueError("The models must have the same spaces of observations and actions.")
     for name, space in (("observation", policy.observation_space), ("action", policy.action_space)):
         if not isinstance(space, spaces.Box):
@@ -192,7 +192,7 @@ def export_onnx(
 
 
 def _hands_on(wrapper: Any, places: tuple[str, ...]) -> bool:
-    """Whether all methods of a wrapper that observations and actions go through are defined in some of these places."""
+    """Tell whether all methods of a wrapper that observations and actions go through are defined in some of these places."""
     names = ("reset", "step", "step_async", "step_wait")
     methods = [getattr(type(wrapper), name) for name in names if hasattr(type(wrapper), name)]
     return all(f"{method.__module__}.{method.__qualname__}".startswith(places) for method in methods)
@@ -205,7 +205,7 @@ def _name(name: str, wrapped: Sequence[Any], places: tuple[str, ...]) -> str:
 
 
 def _is_ours(path: Path) -> bool:
-    """Whether the metadata of a file says that this package has written it."""
+    """Tell from the metadata of a file whether this package has written it."""
     import onnx
 
     try:
@@ -234,8 +234,8 @@ def _checked_file(
     try:
         module = DeterministicPolicy(policies, vec_normalize).eval()
         observations = observations_to_check(policy.observation_space, vec_normalize)
-        seen = observations if vec_normalize is None else vec_normalize.normalize_obs(observations)
-        expected = np.mean([each.predict(seen, deterministic=True)[0] for each in policies], axis=0)
+        inputs = observations if vec_normalize is None else vec_normalize.normalize_obs(observations)
+        expected = np.mean([each.predict(inputs, deterministic=True)[0] for each in policies], axis=0)
         content = with_checksum(graph_of(module, observations[:_N_TRACED], description, names).SerializeToString())
     finally:
         for each, mode in zip(policies, was_training, strict=True):

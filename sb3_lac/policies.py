@@ -288,8 +288,8 @@ class LyapunovPolicy(SACPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         # What SACPolicy leaves out
-        others = {"share_features_extractor": self.share_features_extractor, "root": self.root}
-        return super()._get_constructor_parameters() | others
+        arguments = {"share_features_extractor": self.share_features_extractor, "root": self.root}
+        return super()._get_constructor_parameters() | arguments
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LyapunovCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)

@@ -294,8 +294,8 @@ class PublishedLAC(CostAlgorithm):
         super()._adopt_replay_buffer()
         if self.horizon is not None:
             if not isinstance(self.replay_buffer, HorizonReplayBuffer):
-                found = type(self.replay_buffer).__name__
-                raise ValueError(f"horizon={self.horizon} needs a HorizonReplayBuffer, and this is a {found}.")
+                buffer = type(self.replay_buffer).__name__
+                raise ValueError(f"horizon={self.horizon} needs a HorizonReplayBuffer, and this is a {buffer}.")
             self.replay_buffer.horizon = self.horizon
 
     @property

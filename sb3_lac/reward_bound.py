@@ -10,7 +10,7 @@ from sb3_lac.policies import LyapunovPolicy
 
 
 def reward_scale(vec_normalize: VecNormalize | None) -> float:
-    """What a reward of the environment is divided by before the agent sees it."""
+    """Return the number that a reward of the environment is divided by before the agent observes it."""
     if vec_normalize is None or not vec_normalize.norm_reward:
         return 1.0
     return math.sqrt(vec_normalize.ret_rms.var + vec_normalize.epsilon)

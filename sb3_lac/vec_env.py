@@ -1,3 +1,4 @@
+import inspect
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
@@ -5,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper
@@ -226,3 +227,15 @@ def _of_one(observations: Any, n: int) -> Any:
     if isinstance(observations, dict):
         return {name: _of_one(part, n) for name, part in observations.items()}
     return observations[n]
+
+
+def steps_as_one_batch(spec: EnvSpec) -> bool:
+    """
+    Tell whether all copies of an environment can be stepped by one call: it is registered with a vector environment that lets
+    Stable-Baselines3 say when episodes start anew, and without wrappers that a vector environment would go without.
+    """
+    if spec.vector_entry_point is None or spec.max_episode_steps is not None or spec.additional_wrappers:
+        return False
+    entry_point = spec.vector_entry_point
+    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    return "autoreset_mode" in inspect.signature(creator).parameters

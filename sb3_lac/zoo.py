@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -46,6 +45,7 @@ except ImportError as error:
     raise ImportError("sb3_lac.zoo needs the RL Zoo, install it with: pip install 'sb3_lac[zoo]'") from error
 
 from sb3_lac import LAC, DashboardCallback, GymnasiumVecEnv, PublishedLAC
+from sb3_lac.vec_env import steps_as_one_batch
 
 #: The algorithms that the RL Zoo gets from this package
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"lac": LAC, "published_lac": PublishedLAC}
@@ -100,18 +100,6 @@ def convert_lac_params(sampled_params: Hyperparams) -> Hyperparams:
     hyperparams["ent_coef"] = f"auto_{hyperparams.pop('ent_coef_init')}"
     hyperparams["policy_kwargs"]["n_critics"] = hyperparams.pop("n_critics")
     return hyperparams
-
-
-def steps_as_one_batch(spec: EnvSpec) -> bool:
-    """
-    Whether all copies of an environment can be stepped by one call: it is registered with a vector environment that lets
-    Stable-Baselines3 say when episodes start anew, and without wrappers that a vector environment would go without.
-    """
-    if spec.vector_entry_point is None or spec.max_episode_steps is not None or spec.additional_wrappers:
-        return False
-    entry_point = spec.vector_entry_point
-    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-    return "autoreset_mode" in inspect.signature(creator).parameters
 
 
 class LACExperimentManager(ExperimentManager):
@@ -260,14 +248,14 @@ def main(args: Sequence[str] | None = None) -> None:
     defaults.add_argument("--env")
     if trains:
         defaults.add_argument("-conf", "--conf-file")
-    known, options = defaults.parse_known_args(parsed.options)
+    defaulted, options = defaults.parse_known_args(parsed.options)
     # That of the RL Zoo has discrete actions
-    known.env = known.env or ("Pendulum-v1" if known.algo in ALGORITHMS else "CartPole-v1")
-    options += ["--algo", known.algo, "--env", known.env]
+    defaulted.env = defaulted.env or ("Pendulum-v1" if defaulted.algo in ALGORITHMS else "CartPole-v1")
+    options += ["--algo", defaulted.algo, "--env", defaulted.env]
     if trains:
         # The RL Zoo says which algorithms there are
         with suppress(FileNotFoundError):
-            options += ["--conf-file", known.conf_file or str(find_config(known.algo, known.env))]
+            options += ["--conf-file", defaulted.conf_file or str(find_config(defaulted.algo, defaulted.env))]
     if parsed.command == "optimize":
         options += ["--optimize-hyperparameters"]
     sys.argv = [f"{prog} {parsed.command}", *options]

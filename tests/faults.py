@@ -3,6 +3,7 @@
 import os
 import resource
 import signal
+import time
 from contextlib import contextmanager
 
 
@@ -51,4 +52,12 @@ def squared_after_ends_of_its_process(number, folder):
         with ends.open("ab") as file:
             file.write(b"x")
         os.kill(os.getpid(), signal.SIGKILL)
+    return number**2
+
+
+def squared_after_a_while(number, log):
+    """A call that takes long, and counts how often it is begun."""
+    with log.open("ab") as file:
+        file.write(b"x")
+    time.sleep(2.0)
     return number**2

@@ -167,12 +167,16 @@ class Reason(_Row):
         "The {what} is {ratio:.1f} times the largest that is allowed for: the cell is of another kind, or its load is, or a "
         "sensor is off. Use least squares, without a path."
     )
+    PRIOR_WRONG = (
+        "{name} is {record_Ah:.3g} Ah by the record, outside of the {least_Ah:.3g} to {most_Ah:.3g} Ah that the prior, the "
+        "life or the nominal capacity allows. Check the unit and the gain of the current, that the record is of this cell, "
+        "and what was stated."
+    )
     MISFIT = (
         "The voltage of the model is farther off than noise and mismatch_V explain: fit constants to this cell (fit_cell, "
         "--cell), state a larger mismatch_V (a policy takes none), or check the sensors, the prior if one was given, and that "
         "this is one discharge."
     )
-    PRIOR_WRONG = "The prior of {name} contradicts what the record says."
     RESISTANCE_DIFFERS = (
         "{after_s:.0f} s after the load was switched on, at {step_s:.0f} s, the resistance is {measured_ohm:.3f} ohm as "
         "measured and {model_ohm:.3f} ohm by the fit of the whole record, {apart_sd:.1f} standard deviations apart: current "

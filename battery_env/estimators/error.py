@@ -58,6 +58,7 @@ class ErrorModel:
     :param memory_C: the charge along which the drift loses its memory
     :param load_on_C: the charge that is in doubt between the first sample, at rest, and the second, under load
     :param dropouts_s: spans of time since the first sample in which the voltage is not that of the current, s
+    :param first_noise_V: the noise of the first sample; ``None``: as of all samples
     """
 
     drift_V: float = 0.0
@@ -67,6 +68,7 @@ class ErrorModel:
     memory_C: float = 1.0
     load_on_C: float = 0.0
     dropouts_s: tuple[tuple[float, float], ...] = ()
+    first_noise_V: float | None = None
 
     def along(self, time_s: FloatArray, current_A: FloatArray) -> VoltageError:
         """
@@ -75,6 +77,8 @@ class ErrorModel:
         doubt, and what the moment of the switch, between two samples, makes of it.
         """
         noise_V = np.full(len(time_s), self.noise_V)
+        if self.first_noise_V is not None:
+            noise_V[0] = self.first_noise_V
         for begin_s, end_s in self.dropouts_s:
             noise_V[(time_s >= begin_s) & (time_s < end_s)] = inf
         if self.drift_V == 0.0:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from math import hypot
+from functools import cached_property
+from math import hypot, log, sqrt
 
 import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K, check_positive
 from battery_env.electrochemistry import CellParameters, check_cell, check_dt
+from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES
 from battery_env.electrochemistry.cell import Q_MOBILE_PER_CAPACITY, new_cell_of
-from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_equilibrium
 from battery_env.electrochemistry.model_error import ERRORS_PER_DISCHARGE, independent_errors
-from battery_env.electrochemistry.tangents import BY_Q, BY_R, RATE_CONSTANTS
+from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import (
     RATE_PRIOR_SD,
@@ -30,9 +30,17 @@ from battery_env.estimators.cell_fit import (
 )
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, BELOW_REST_V, usual_start
+from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.search import MARGIN, OnGrid, distance_C, minimized, spread_over, square
-from battery_env.parameters import Q_MOBILE, R_O
+from battery_env.estimators.search import (
+    JointSearch,
+    Prior,
+    Search,
+    spread_over,
+    square,
+    standard_deviations,
+)
+from battery_env.parameters import PARAMETER_NAMES, PARAMETERS, Q_MOBILE
 from battery_env.records import (
     CUT_OFF_V,
     Record,
@@ -58,9 +66,9 @@ _ROUNDS = 3
 _FIRST_MISMATCH_V = 0.02
 #: Each discharge shows so many independent errors of the model, unless its residuals change their sign more often.
 INDEPENDENT_ERRORS = independent_errors(1.0, ERRORS_PER_DISCHARGE["fit"])
-# The search: how many standard deviations of its prior a constant may move, the logarithm of the distance of q_mobile to its
-# least value, C, and the scale of r_o, ohm.
-_REACH_SD, _LOG_DISTANCE_LIMITS, _R_O_SCALE_OHM = 6.0, (-30.0, 16.0), 0.1
+# The search: how many standard deviations of its prior a constant may move, and the logarithm of the distance of q_mobile to
+# its least value, C.
+_REACH_SD, _LOG_DISTANCE_LIMITS = 6.0, (-30.0, 16.0)
 # Where the search for q_mobile starts beside the fit with the constants known before, and how near that may be to its least
 # value, as shares of it.
 _START_EXCESS, _LEAST_EXCESS = 0.02, 1e-4
@@ -190,17 +198,6 @@ def _name(record: Record, number: int) -> str:
 
 
 @dataclass(frozen=True)
-class AtDischarge:
-    """The model of one discharge at an x of the search."""
-
-    residual_V: FloatArray  # at the samples
-    jacobian: FloatArray  # of these, by x
-    q_mobile: float
-    r_o: float
-    q_gradient_C: FloatArray  # of q_mobile, by x
-
-
-@dataclass(frozen=True)
 class _Weights:
     """How much the residuals of each discharge count."""
 
@@ -210,9 +207,8 @@ class _Weights:
 
 class JointFit:
     """
-    The search over the constants and, for each discharge, ``q_mobile`` and ``r_o``. An x holds, in this order: of each
-    constant how many standard deviations of its prior it has moved; of each discharge the logarithm of the distance of
-    ``q_mobile`` to its least value; of each discharge ``r_o`` in units of ``_R_O_SCALE_OHM``.
+    The search over the constants, which all discharges share, and over ``q_mobile`` and ``r_o`` of each. Its values are a
+    mapping for each discharge, in which the constants are the same.
     """
 
     def __init__(
@@ -220,165 +216,112 @@ class JointFit:
     ) -> None:
         self.model = RecordModel(start, thermal, dt_s)
         self.names = [_name(record, number) for number, record in enumerate(records, start=1)]
-        self.sd = np.array([*(RATE_PRIOR_SD[name] for name in RATE_CONSTANTS), *EQUILIBRIUM_PRIOR_SD_V])
         self.records, self.at_rest = records, at_rest  # whether the first sample is the voltage of a full cell at rest
-        self.data = [_thinned(OnGrid.of(record, self.model)) for record in records]
+        self.sd = {name: RATE_PRIOR_SD[name] for name in RATE_CONSTANTS}
+        self.sd |= zip(EQUILIBRIUM_NAMES, EQUILIBRIUM_PRIOR_SD_V, strict=True)
+        self.priors = [Prior(name, 0.0, 1.0 / sd) for name, sd in self.sd.items()]
+        bounds = {name: parameter.limits for name, parameter in PARAMETERS.items()}
+        bounds |= {name: (-_REACH_SD * sd, _REACH_SD * sd) for name, sd in self.sd.items()}
+        for name in ("to", "tsn", "tsp"):  # the model is stable at twice this step
+            low, high = bounds[name]
+            bounds[name] = max(low, log(dt_s / getattr(start, name))), high
+        self.searches = [_thinned(Search.of(record, self.model, PARAMETER_NAMES, self.sd, bounds)) for record in records]
+        self.limits = bounds | {"q_mobile": _LOG_DISTANCE_LIMITS}
         self.charges_C = np.array([drawn_charge_C(record) for record in records])
-        self._evaluated = lru_cache(maxsize=1)(self.evaluate)
 
     @cached_property
     def before(self) -> list[tuple[Estimate, float]]:
         """With the constants known before, what fits best to each discharge, and the error left, V."""
-        return [self._alone(self.model.cell, d) for d in range(len(self.data))]
+        return [self._alone(dict.fromkeys(self.sd, 0.0), d) for d in range(len(self.searches))]
 
-    def _alone(self, cell: CellParameters, d: int) -> tuple[Estimate, float]:
+    def _alone(self, constants: dict[str, float], d: int) -> tuple[Estimate, float]:
         """With some constants, what fits best to one discharge, and the error left (root mean square), V."""
-        model, data = self.model.of_cell(cell), self.data[d]
+        model, search = self.model, self.searches[d]
+        cell = search.model_at(constants).cell
         estimate = LeastSquares(cell=cell, thermal=model.thermal, dt_s=model.dt_s).estimate(self.records[d])
-        (voltage_V,) = data.at_samples([model.tangents(data.current_A, estimate.q_mobile, estimate.r_o).voltage_V])
-        return estimate, _rms(voltage_V - data.voltage_V)
+        residual_V, _ = search.residual({**constants, "q_mobile": estimate.q_mobile, "r_o": estimate.r_o})
+        return estimate, _rms(residual_V)
 
-    def cell(self, x: FloatArray) -> CellParameters:
-        """The constants of an x."""
-        start, moved = self.model.cell, x[: len(self.sd)] * self.sd
-        rates = {
-            name: getattr(start, name) * float(np.exp(log))
-            for name, log in zip(RATE_CONSTANTS, moved[: len(RATE_CONSTANTS)], strict=True)
-        }
-        return with_equilibrium(start.replace(**rates), moved[len(RATE_CONSTANTS) :])
-
-    def starts(self) -> list[FloatArray]:
+    def starts(self) -> list[list[dict[str, float]]]:
         """Where to start: at the constants known before."""
-        least_C = np.array([self.model.least_q_mobile_C(data.current_A) for data in self.data])
-        fitted_C = np.array([estimate.q_mobile for estimate, _ in self.before]) - least_C
-        r_o = [estimate.r_o / _R_O_SCALE_OHM for estimate, _ in self.before]
+        constants, estimates = dict.fromkeys(self.sd, 0.0), [estimate for estimate, _ in self.before]
+        least_C = np.array([search.least_q_C for search in self.searches])
+        fitted_C = np.maximum([each.q_mobile for each in estimates], (1.0 + _LEAST_EXCESS) * least_C)
         return [
-            np.concatenate([np.zeros(len(self.sd)), np.log(np.maximum(above_C, _LEAST_EXCESS * least_C)), r_o])
-            for above_C in (fitted_C, _START_EXCESS * least_C)
+            [{**constants, "q_mobile": q, "r_o": each.r_o} for q, each in zip(q_C.tolist(), estimates, strict=True)]
+            for q_C in (fitted_C, (1.0 + _START_EXCESS) * least_C)
         ]
 
     def solve(self) -> CellFit:
         """The best fit that is found from any start, with the weights that its residuals imply."""
-        weights = _Weights(_FIRST_MISMATCH_V, np.full(len(self.data), INDEPENDENT_ERRORS))
-        found = [self._search(x, weights) for x in self.starts()]
-        best = min(found, key=lambda x: square(self._objective(x, weights)[0]))
+        search = self._weighed_by(_Weights(_FIRST_MISMATCH_V, np.full(len(self.records), INDEPENDENT_ERRORS)))
+        found = [self._minimized(search, start) for start in self.starts()]
+        best = min(found, key=lambda values: square(search.weighed(values)[0]))
         for _ in range(_ROUNDS):
-            weights = self._weights(best, weights)
-            best = self._search(best, weights)
-        return self._result(best, self._weights(best, weights))
+            search = self._weighed_by(self._weights(search, best))
+            best = self._minimized(search, best)
+        weights = self._weights(search, best)
+        return self._result(self._weighed_by(weights), best, weights.mismatch_V)
 
-    def _bounds(self) -> tuple[FloatArray, FloatArray]:
-        low, high = np.full(len(self.sd), -_REACH_SD), np.full(len(self.sd), _REACH_SD)
-        for k, name in enumerate(RATE_CONSTANTS):
-            if name in ("to", "tsn", "tsp"):  # the model is stable at twice this step
-                low[k] = max(low[k], np.log(self.model.dt_s / getattr(self.model.cell, name)) / self.sd[k])
-        (least, most), each = _LOG_DISTANCE_LIMITS, np.ones(len(self.data))
-        low_r, high_r = R_O.limits
-        return (
-            np.concatenate([low, least * each, low_r / _R_O_SCALE_OHM * each]),
-            np.concatenate([high, most * each, high_r / _R_O_SCALE_OHM * each]),
-        )
+    def _weighed_by(self, weights: _Weights) -> JointSearch:
+        """The search with these errors of the voltage; one sample alone says what a full cell shows, however many follow."""
+        searches = []
+        for search, at_rest, count in zip(self.searches, self.at_rest, weights.independent.tolist(), strict=True):
+            noise_V = weights.mismatch_V * sqrt(len(search.data.time_s) / count)
+            error = ErrorModel(noise_V=noise_V, first_noise_V=weights.mismatch_V if at_rest else None)
+            searches.append(replace(search, error=error))
+        return JointSearch(searches, self.priors)
 
-    def _search(self, x: FloatArray, weights: _Weights) -> FloatArray:
-        low, high = self._bounds()
-        room = 1e-6 * (high - low)
+    def _minimized(self, search: JointSearch, start: Sequence[dict[str, float]]) -> list[dict[str, float]]:
         tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), 1e-7)
-        x = np.clip(x, low + room, high - room)
-        return minimized(lambda x: self._objective(x, weights), x, bounds=(low, high), max_nfev=200, **tolerances)
+        return search.minimized(start, search.searches[0].unknown, self.limits, max_nfev=200, **tolerances)
 
-    def _objective(self, x: FloatArray, weights: _Weights) -> tuple[FloatArray, FloatArray]:
-        """Weighted residuals and distances to the priors, and their derivatives."""
-        n = len(self.sd)
-        residuals, derivatives = [], []
-        for seen, at_rest, count in zip(self._evaluated(tuple(x)), self.at_rest, weights.independent, strict=True):
-            scale = _scale(len(seen.residual_V), at_rest, count) / weights.mismatch_V
-            residuals.append(scale * seen.residual_V)
-            derivatives.append(scale[:, None] * seen.jacobian)
-        return np.concatenate([*residuals, x[:n]]), np.concatenate([*derivatives, np.eye(n, len(x))])
-
-    def evaluate(self, x: Sequence[float]) -> list[AtDischarge]:
-        """The model of every discharge at an x."""
-        values = np.array(x)
-        model = self.model.of_cell(self.cell(values))
-        n, rates = len(self.sd), len(RATE_CONSTANTS)
-        t_diffusion = RATE_CONSTANTS.index("tDiffusion")
-        found = []
-        for d, data in enumerate(self.data):
-            u, r = n + d, n + len(self.data) + d
-            least_C, least_by_log_C = model.least_q_mobile_tangent_C(data.current_A)
-            above_C, r_o = distance_C(values[u]), _R_O_SCALE_OHM * float(values[r])
-            q_mobile = (1.0 + MARGIN) * least_C + above_C
-            q_gradient_C = np.zeros(len(values))
-            q_gradient_C[u] = above_C
-            q_gradient_C[t_diffusion] = (1.0 + MARGIN) * least_by_log_C * self.sd[t_diffusion]
-            voltage_V, by_parameter, fraction_p = model.tangents(data.current_A, q_mobile, r_o)
-            columns = by_parameter[BY_Q] * q_gradient_C[:, None]
-            columns[:rates] += self.sd[:rates, None] * by_parameter[BY_R + 1 :]
-            columns[rates:n] = self.sd[rates:, None] * equilibrium_slopes(fraction_p, n - rates)
-            columns[r] = _R_O_SCALE_OHM * by_parameter[BY_R]
-            seen_V, *by_x = data.at_samples([voltage_V, *columns])
-            found.append(AtDischarge(seen_V - data.voltage_V, np.column_stack(by_x), q_mobile, r_o, q_gradient_C))
-        return found
-
-    def _covariance(self, x: FloatArray, weights: _Weights) -> FloatArray:
-        jacobian = self._objective(x, weights)[1]
-        return np.asarray(np.linalg.pinv(jacobian.T @ jacobian))
-
-    def _weights(self, x: FloatArray, weights: _Weights) -> _Weights:
+    def _weights(self, search: JointSearch, values: Sequence[dict[str, float]]) -> _Weights:
         """What the residuals say about their own size, and how many of them are independent."""
-        residuals_V = [seen.residual_V for seen in self._evaluated(tuple(x))]
+        residuals_V = search.residuals_V(values)
         changes = [float(np.count_nonzero(np.diff(np.signbit(residual)))) for residual in residuals_V]
         independent = np.maximum(changes, INDEPENDENT_ERRORS)
         # what was fitted makes residuals smaller than errors, by as much as the data determine
-        left = np.diag(self._covariance(x, weights))[: len(self.sd)]
-        fitted = float(np.sum(1.0 - left)) + 2.0 * len(residuals_V)
+        sds = standard_deviations(search.weighed(values)[1])[-len(self.sd) :] / np.array(list(self.sd.values()))
+        fitted = float(np.sum(1.0 - sds**2)) + 2.0 * len(residuals_V)
         square_V2 = sum(count * _rms(residual) ** 2 for count, residual in zip(independent, residuals_V, strict=True))
         return _Weights(max(float(np.sqrt(square_V2 / (independent.sum() - fitted))), RESOLUTION_V), independent)
 
-    def _left_out_V(self, x: FloatArray, weights: _Weights) -> list[float | None]:
+    def _left_out_V(self, search: JointSearch, values: Sequence[dict[str, float]]) -> list[float | None]:
         """
         How far each discharge is from constants that were fitted without it, and without those of its age (root mean square),
         V. That is what a discharge shows that nobody has fitted; of one alone its parts do.
         """
-        count, n = len(self.data), len(self.sd)
-        if count == 1:
-            return [self._parts_left_out_V(x, weights)]
-        errors_V: list[float | None] = [None] * count
-        for group, kept in groups([at.q_mobile for at in self._evaluated(tuple(x))]):
-            others = JointFit(
-                [self.records[d] for d in kept],
-                [self.at_rest[d] for d in kept],
-                self.model.cell,
-                self.model.thermal,
-                self.model.dt_s,
-            )
-            own = np.append(np.arange(n), (n + kept, n + count + kept))
-            fitted = others._search(x[own], _Weights(weights.mismatch_V, weights.independent[kept]))
+        if len(values) == 1:
+            return [self._parts_left_out_V(search, values)]
+        errors_V: list[float | None] = [None] * len(values)
+        for group, kept in groups([at["q_mobile"] for at in values]):
+            others = replace(search, searches=[search.searches[d] for d in kept])
+            fitted = self._minimized(others, [values[d] for d in kept])[0]
             for d in group.tolist():
                 try:
-                    errors_V[d] = self._alone(others.cell(fitted), d)[1]
+                    errors_V[d] = self._alone({name: fitted[name] for name in self.sd}, d)[1]
                 except ValueError as error:
                     raise ValueError(
                         f"constants fitted to the other discharges cannot follow {self.names[d]}: leave it out"
                     ) from error
         return errors_V
 
-    def _parts_left_out_V(self, x: FloatArray, weights: _Weights) -> float:
+    def _parts_left_out_V(self, search: JointSearch, values: Sequence[dict[str, float]]) -> float:
         """
         How far the parts of the only discharge, one for each independent error, are from constants that were fitted to its
         others (root mean square), V; to first order, and no farther than constants that were not fitted.
         """
         n = len(self.sd)
-        residual, jacobian = (rows[:-n] for rows in self._objective(x, weights))
+        residual, jacobian = (rows[:-n] for rows in search.weighed(values))
         # q_mobile and r_o are always fitted to all of a discharge
-        own = jacobian[:, n:]
-        by_constants = jacobian[:, :n] - own @ np.linalg.lstsq(own, jacobian[:, :n], rcond=None)[0]
-        covariance, left_out = np.linalg.inv(by_constants.T @ by_constants + np.eye(n)), residual.copy()
+        own, by_constants = jacobian[:, :-n], jacobian[:, -n:] * np.array(list(self.sd.values()))
+        by_constants = by_constants - own @ np.linalg.lstsq(own, by_constants, rcond=None)[0]
+        inverse, left_out = np.linalg.inv(by_constants.T @ by_constants + np.eye(n)), residual.copy()
         for part in np.array_split(np.arange(len(residual)), int(INDEPENDENT_ERRORS)):
-            shares = by_constants[part] @ covariance @ by_constants[part].T
+            shares = by_constants[part] @ inverse @ by_constants[part].T
             left_out[part] = np.linalg.solve(np.eye(len(part)) - shares, residual[part])
-        scale = _scale(len(residual), self.at_rest[0], float(weights.independent[0]))
-        return min(_rms(weights.mismatch_V * left_out / scale), UNFITTED_MISMATCH_V)
+        return min(_rms(search.searches[0].error_at_samples.noise_V * left_out), UNFITTED_MISMATCH_V)
 
     def _expected_V(self, discharges: Sequence[FittedDischarge], residual_V: float) -> float:
         """The error to expect of any discharge of the cell: of those left out, and of ages and charges that none shows."""
@@ -388,56 +331,47 @@ class JointFit:
         unseen_V = hypot(aged_V(unseen_of_life(q_mobile_C)), UNFITTED_MISMATCH_V * max(undrawn, 0.0))
         return hypot(max(residual_V, _rms(np.array(shown_V or [0.0]))), unseen_V)
 
-    def _result(self, x: FloatArray, weights: _Weights) -> CellFit:
+    def _result(self, search: JointSearch, values: Sequence[dict[str, float]], mismatch_V: float) -> CellFit:
         """What was found."""
-        start, cell, n, seen = self.model.cell, self.cell(x), len(self.sd), self._evaluated(tuple(x))
-        covariance = self._covariance(x, weights)
-        sds = np.sqrt(np.diag(covariance))
-        before = [getattr(start, name) for name in RATE_CONSTANTS] + [0.0] * len(EQUILIBRIUM_PRIOR_SD_V)
-        after = [getattr(cell, name) for name in RATE_CONSTANTS] + (self.sd * x[:n])[len(RATE_CONSTANTS) :].tolist()
-        names = [*RATE_CONSTANTS, *(f"equilibrium {k}" for k in range(len(EQUILIBRIUM_PRIOR_SD_V)))]
-        rows = zip(names, before, self.sd.tolist(), after, (self.sd * sds[:n]).tolist(), strict=True)
-        constants = tuple(FittedConstant(name, prior, prior_sd, value, sd) for name, prior, prior_sd, value, sd in rows)
+        start, cell = self.model.cell, search.searches[0].model_at(values[0]).cell
+        sds = standard_deviations(search.weighed(values)[1]).tolist()
+        constants = []
+        for name, sd in zip(self.sd, sds[-len(self.sd) :], strict=True):
+            is_rate = name in RATE_CONSTANTS
+            before, after = (getattr(each, name) for each in (start, cell)) if is_rate else (0.0, values[0][name])
+            constants.append(FittedConstant(name, before, self.sd[name], after, sd))
+        residuals_V = search.residuals_V(values)
         discharges = [
             FittedDischarge(
-                name,
-                at.q_mobile,
-                at.r_o,
-                sd_q_mobile=float(np.sqrt(at.q_gradient_C @ covariance @ at.q_gradient_C)),
-                sd_r_o=float(_R_O_SCALE_OHM * sds[n + len(seen) + d]),
-                rmse_V=_rms(at.residual_V),
-                rmse_before_V=before_V,
+                self.names[d],
+                at["q_mobile"],
+                at["r_o"],
+                sd_q_mobile=sds[2 * d],
+                sd_r_o=sds[2 * d + 1],
+                rmse_V=_rms(residuals_V[d]),
+                rmse_before_V=self.before[d][1],
                 left_out_V=left_out_V,
-                current_A=mean_current_A(record),
+                current_A=mean_current_A(self.records[d]),
             )
-            for d, (name, (_, before_V), at, left_out_V, record) in enumerate(
-                zip(self.names, self.before, seen, self._left_out_V(x, weights), self.records, strict=True)
-            )
+            for d, (at, left_out_V) in enumerate(zip(values, self._left_out_V(search, values), strict=True))
         ]
         largest = max(discharges, key=lambda discharge: discharge.q_mobile)
         new = {"q_mobile": largest.q_mobile, "r_o": largest.r_o}
         return CellFit(
             cell.replace(**new),
             start.replace(**new),
-            self._expected_V(discharges, weights.mismatch_V),
-            _rms(np.concatenate([at.residual_V for at in seen])),
+            self._expected_V(discharges, mismatch_V),
+            _rms(np.concatenate(residuals_V)),
             self.model.thermal,
-            constants,
+            tuple(constants),
             tuple(discharges),
         )
 
 
-def _thinned(data: OnGrid) -> OnGrid:
-    kept = spread_over(len(data.time_s), _MOST_SAMPLES)
-    return replace(data, time_s=data.time_s[kept], voltage_V=data.voltage_V[kept])
-
-
-def _scale(samples: int, at_rest: bool, independent: float) -> FloatArray:
-    """How much the residuals of a discharge count, over what one that is independent does."""
-    scale = np.full(samples, np.sqrt(independent / samples))
-    if at_rest:
-        scale[0] = 1.0  # one sample alone says what a full cell shows, however many follow
-    return scale
+def _thinned(search: Search) -> Search:
+    kept = spread_over(len(search.data.time_s), _MOST_SAMPLES)
+    data = replace(search.data, time_s=search.data.time_s[kept], voltage_V=search.data.voltage_V[kept])
+    return replace(search, data=data)
 
 
 def _rms(values: FloatArray) -> float:

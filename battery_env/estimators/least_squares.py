@@ -13,28 +13,24 @@ from numpy.typing import ArrayLike
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_gain_sd, check_not_negative, check_positive
 from battery_env.electrochemistry import CellParameters
-from battery_env.electrochemistry.aging_path import PATH_DISTANCE_LIMIT_SD, PATH_NAMES, AgingPath
-from battery_env.electrochemistry.model_error import CORRELATION_SHARE, UNFITTED_ERROR_RATIO, independent_errors
+from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate, EstimateTrace
 from battery_env.estimates.findings import Reason
-from battery_env.estimators.diagnosis.evidence import Evidence, dropouts_of, evidence_of
+from battery_env.estimators.diagnosis.evidence import Evidence, evidence_of
 from battery_env.estimators.diagnosis.faults import MOST_NOISE_SD
 from battery_env.estimators.diagnosis.knee import knee_sd_C
 from battery_env.estimators.diagnosis.rest import InitialSoc, check_initial_soc
-from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.estimator import Estimator, check_bounds
+from battery_env.estimators.priors import CellPrior, PathPrior
 from battery_env.estimators.resistance import PULSE_S, ModelResistance, later_step, load_on
 from battery_env.estimators.search import (
-    MARGIN,
-    AnyPrior,
     Fit,
-    JointPrior,
     Prior,
     Search,
     SizePrior,
-    root_inverse_diagonal,
     square,
+    standard_deviations,
 )
 from battery_env.estimators.verdict import (
     PRIOR_LIMIT_SD,
@@ -55,7 +51,6 @@ from battery_env.records import (
     Record,
     Samples,
     check_record,
-    drawn_charge_C,
     history_of,
 )
 from battery_env.records.model import RecordModel
@@ -64,14 +59,22 @@ from battery_env.records.model import RecordModel
 _LEAST_NOISE_V = 1e-4
 # The effect of the charge at the start is taken over this step.
 _SOC_STEP = 1e-3
-# Starts along a path, in standard deviations of its q_mobile; and how far above what the record allows they keep, as a share.
-_STARTS_SD, _START_ABOVE = (-1.5, -0.5, 0.5, 1.5), 0.02
+
+
+class Alternative(NamedTuple):
+    """A cell that a record leaves open: its model, ``q_mobile``, C, and ``r_o``, ohm."""
+
+    model: RecordModel
+    q_mobile: float
+    r_o: float
 
 
 @dataclass(frozen=True)
-class _Fitted:
-    """What the search says of a record, and how sure that is."""
+class RecordFit:
+    """What the search says of a record, and how sure that is (:meth:`LeastSquares.fit`)."""
 
+    record: Samples
+    history: ChargeHistory
     search: Search
     fit: Fit  # with all priors
     alone: Fit  # without the prior of q_mobile
@@ -82,11 +85,30 @@ class _Fitted:
     def sd(self, fit: Fit, ratios: Mapping[str, float]) -> dict[str, float]:
         """The standard deviations of a fit, so many times as large as it says, with those of what does not show."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
-        for name, root in zip(self.search.parameters, root_inverse_diagonal(fit.jacobian), strict=False):
+        for name, root in zip(self.search.parameters, standard_deviations(fit.jacobian), strict=False):
             ratio = ratios.get(name, 1.0) * (fit.spread if name == "q_mobile" else 1.0)
             knee_sd_C = fit.knee_sd_C if name == "q_mobile" else 0.0
             sd[name] = hypot(ratio * sqrt(self.variance) * float(root), self.hidden_sd[name], knee_sd_C)
         return sd
+
+    def alternatives(self) -> list[Alternative]:
+        """
+        The cell that fits best; and those a standard deviation to each side, in each direction in which all unknowns are open.
+        """
+        fit, names = self.fit, self.search.unknown
+        roots = np.linalg.cholesky(self.variance * np.linalg.pinv(fit.jacobian.T @ fit.jacobian, hermitian=True)).T
+        cells = [fit.values]
+        cells += [
+            fit.values | {n: fit.values[n] + float(move) for n, move in zip(names, row, strict=True)}
+            for row in (*roots, *-roots)
+        ]
+        (least_C, most_C), (least_ohm, most_ohm) = Q_MOBILE.limits, R_O.limits
+        return [
+            Alternative(
+                self.search.model_at(at), min(max(at["q_mobile"], least_C), most_C), min(max(at["r_o"], least_ohm), most_ohm)
+            )
+            for at in cells
+        ]
 
 
 class _Resistance(NamedTuple):
@@ -95,14 +117,6 @@ class _Resistance(NamedTuple):
     ohm: float = nan
     sd_ohm: float = nan
     load_on_ohm: float = 0.0
-
-
-class Alternative(NamedTuple):
-    """A cell that a record leaves open: its model, ``q_mobile``, C, and ``r_o``, ohm."""
-
-    model: RecordModel
-    q_mobile: float
-    r_o: float
 
 
 class LeastSquares(Estimator):
@@ -187,19 +201,17 @@ class LeastSquares(Estimator):
         path: AgingPath | None = None,
         usual_start: DischargeStart | None = None,
     ) -> None:
-        self.parameters = check_parameters(parameters)
-        self.nuisance = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
-        self.path, self.usual_start = path, usual_start
-        # so many times larger than the fit says are standard deviations, but for that of a prior
-        self._sd_ratio = 1.0 if path is None else path.sd_ratio
+        self.parameters, self.usual_start = check_parameters(parameters), usual_start
+        sds = _check_nuisance({} if nuisance is None else nuisance, self.parameters)
+        check_not_negative(mismatch_V=mismatch_V)
         if path is not None:
-            if self.nuisance or self.parameters != PARAMETER_NAMES:
+            if sds or self.parameters != PARAMETER_NAMES:
                 raise ValueError("path is of both parameters and of all nuisances: leave parameters and nuisance out")
-            sds = np.sqrt(np.diag(path.moments[1])).tolist()
-            self.nuisance = {name: sd for name, sd in zip(PATH_NAMES, sds, strict=True) if name not in PARAMETER_NAMES}
             cell, mismatch_V = cell or path.cell, mismatch_V or path.mismatch_V
         self.initial_soc = check_initial_soc(initial_soc)
         self.model = RecordModel(cell, thermal, dt_s, initial, self.initial_soc[0])
+        known = self.model.cell, mismatch_V, initial is None
+        self.prior = CellPrior(*known, sds, sd_ratio=1.0) if path is None else PathPrior.of(path, *known)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         if prior_q_mobile_C is not None:
             if "q_mobile" not in self.parameters:
@@ -210,10 +222,7 @@ class LeastSquares(Estimator):
         if usual_q_mobile_C is not None:
             check_positive("usual_q_mobile_C", usual_q_mobile_C)
         self.prior_q_mobile_C, self.usual_q_mobile_C = prior_q_mobile_C, usual_q_mobile_C
-        check_not_negative(mismatch_V=mismatch_V)
-        self.mismatch_V = mismatch_V
         self.current_gain_sd = check_gain_sd(current_gain_sd)
-        self._at_rest = initial is None
         for name, value in (("voltage_noise_V", voltage_noise_V), ("window_every_s", window_every_s)):
             if value is not None and not 0.0 < value < np.inf:
                 raise ValueError(f"{name} must be greater than 0, got {value!r}")
@@ -228,7 +237,11 @@ class LeastSquares(Estimator):
         :return: the estimate
         :raises ValueError: if the record cannot be used, or the least ``q_mobile`` it allows is outside the bounds
         """
-        return self._estimate(self._samples(record), self._history(record))
+        return self.estimate_of(self.fit(record))
+
+    def fit(self, record: Record) -> RecordFit:
+        """The search of :meth:`estimate`, which also says what other cells a record leaves open."""
+        return self._fit(self._samples(record), self._history(record))
 
     def trace(self, records: Sequence[Record]) -> list[EstimateTrace]:
         """
@@ -253,7 +266,7 @@ class LeastSquares(Estimator):
         estimates: list[Estimate] = []
         for stop in stops:
             previous = estimates[-1] if estimates else None
-            estimates.append(self._estimate(whole.first(stop), self._history(record), previous))
+            estimates.append(self.estimate_of(self._fit(whole.first(stop), self._history(record), previous)))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
     def _samples(self, record: Record) -> Samples:
@@ -264,48 +277,12 @@ class LeastSquares(Estimator):
         history = history_of(record, self.usual_start)
         return history if self.initial_soc[0] == 1.0 else history._replace(charge=None)
 
-    def alternatives(self, record: Record) -> list[Alternative]:
-        """
-        The cell that fits best to a record; and those a standard deviation to each side, in each direction in which all
-        unknowns are open. A ``ValueError`` as of :meth:`estimate`.
-        """
-        samples = self._samples(record)
-        search, starts = self._search(samples)
-        fitted = self._fitted(samples, search, starts, self._history(record))
-        fit, names = fitted.fit, fitted.search.unknown
-        roots = np.linalg.cholesky(fitted.variance * np.linalg.pinv(fit.jacobian.T @ fit.jacobian, hermitian=True)).T
-        found = [fit.values]
-        found += [
-            fit.values | {n: fit.values[n] + float(move) for n, move in zip(names, row, strict=True)}
-            for row in (*roots, *-roots)
-        ]
-        (least_C, most_C), (least_ohm, most_ohm) = Q_MOBILE.limits, R_O.limits
-        return [
-            Alternative(
-                search.model_at(at), min(max(at["q_mobile"], least_C), most_C), min(max(at["r_o"], least_ohm), most_ohm)
-            )
-            for at in found
-        ]
-
-    def _search(self, record: Samples, previous: Estimate | None = None) -> tuple[Search, list[dict[str, float]]]:
-        """The search in a record, and where to start it."""
-        search = Search.of(record, self.model, self.parameters, self.nuisance, self.bounds)
-        if self.path is not None:
-            starts = _starts_along(self.path, search)
-        elif "q_mobile" in self.parameters:
-            starts = search.best_starts([] if previous is None else [previous.q_mobile])
-        else:
-            search = search.until_empty()
-            starts = search.starts([self.model.cell.q_mobile])[0]
-        return search, starts
-
-    def _estimate(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> Estimate:
-        search, starts = self._search(record, previous)
-        fitted = self._fitted(record, search, starts, history)
-        sd = fitted.sd(fitted.fit, dict.fromkeys(self.parameters, self._sd_ratio))
-        resistance = self._resistance(record, history, fitted, fitted.fit)
-        values, verdict = fitted.fit.values, self._verdict(record, history, fitted)
-        constants = {name: values[name] for name in self.nuisance if name != "offset_V"} or None
+    def estimate_of(self, fitted: RecordFit) -> Estimate:
+        """The estimate of a record, from :meth:`fit`."""
+        sd = fitted.sd(fitted.fit, dict.fromkeys(self.parameters, self.prior.sd_ratio))
+        resistance = self._resistance(fitted, fitted.fit)
+        values, verdict = fitted.fit.values, self._verdict(fitted)
+        constants = {name: values[name] for name in self.prior.nuisance if name != "offset_V"} or None
         return Estimate(
             q_mobile=values["q_mobile"],
             r_o=values["r_o"],
@@ -317,65 +294,42 @@ class LeastSquares(Estimator):
             constants=constants,
         )
 
-    def _fitted(self, record: Samples, search: Search, starts: list[dict[str, float]], history: ChargeHistory) -> _Fitted:
+    def _fit(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> RecordFit:
         """The best fits with and without the prior, and what their standard deviations are made of."""
-        noise_V, at_start_V = self.voltage_noise_V, search.residual(dict.fromkeys(self.nuisance, 0.0) | starts[0])[0]
-        usual_C = self.usual_q_mobile_C
-        if noise_V is None and (self.nuisance or self.mismatch_V or usual_C):  # what else is known is weighed against it
+        prior, noise_V, usual_C = self.prior, self.voltage_noise_V or 0.0, self.usual_q_mobile_C
+        is_open = "q_mobile" in self.parameters
+        search = Search.of(record, self.model, self.parameters, prior.nuisance, self.bounds)
+        search = search if is_open else search.until_empty()
+        starts = prior.starts(search, previous)
+        at_start_V = search.residual(dict.fromkeys(prior.nuisance, 0.0) | starts[0])[0]
+        if not noise_V and (prior.nuisance or prior.mismatch_V or usual_C):  # what else is known is weighed against it
             noise_V = max(white_noise_V(at_start_V), _LEAST_NOISE_V)
-        if self.path is None:
-            priors: list[AnyPrior] = [Prior(name, 0.0, 1.0 / sd) for name, sd in self.nuisance.items()]
-            cell, drift_V = self.model.cell, UNFITTED_ERROR_RATIO * self.mismatch_V
-            if drift_V and noise_V and self._at_rest:  # it is no smaller than the voltage at rest shows, beyond noise
-                start_V2 = float(at_start_V[0]) ** 2 - (MOST_NOISE_SD * noise_V) ** 2 - self.mismatch_V**2
-                drift_V = hypot(drift_V, sqrt(max(start_V2, 0.0)))
-            error = ErrorModel(
-                drift_V,
-                noise_V or 1.0,
-                cell.r_o,
-                cell.to,
-                CORRELATION_SHARE * starts[0]["q_mobile"],
-                history.load_on_C,
-                tuple((each.begin_s, each.end_s) for each in dropouts_of(record, cell)),
-            )
-        else:
-            mean, covariance = self.path.moments
-            priors = [JointPrior(PATH_NAMES, mean, np.linalg.cholesky(np.linalg.inv(covariance)).T)]
-            errors = independent_errors(drawn_charge_C(record), self.path.errors_per_C)
-            mismatch_V = sqrt(len(search.data.time_s) / errors) * self.mismatch_V
-            error = ErrorModel(noise_V=hypot(noise_V or 0.0, mismatch_V))
+        priors = prior.residuals()
+        error = prior.error(record, history, starts[0]["q_mobile"], float(at_start_V[0]), noise_V)
         search = replace(search, error=error)
         if usual_C is not None:
             priors.append(SizePrior(usual_C))
             starts = [*starts, *search.starts([usual_C])[0]]
-        alone = fit = search.best(starts, priors)
-        variance = 1.0 if noise_V else square(alone.residual_V) / (len(alone.residual_V) - len(self.parameters))
-        if "q_mobile" in self.parameters:
+        fit = search.best(starts, priors)
+        n = len(fit.residual_V)
+        variance = 1.0 if noise_V else square(fit.residual_V) / (n - len(self.parameters))
+        if is_open:
             # a model that is exact, or of cells of this kind, has no other knee
-            is_sure = error.drift_V == 0.0
-            knee_C = 0.0 if is_sure else knee_sd_C(record, _model_V(record, alone), self.model.cell.VEOD)
-            alone = fit = replace(alone, spread=search.spread(alone, priors, variance), knee_sd_C=knee_C)
-        if usual_C is not None:  # which nobody has stated: a settled estimate does not rest on it, and nothing contradicts it
-            alone = replace(fit, jacobian=fit.jacobian[:-1])
-        if self.path is not None:
-            # what goes together along the path is a prior of q_mobile too, on which a settled estimate must not rest
-            loose = np.pad(np.diag(1.0 / np.array(list(self.nuisance.values()))), ((0, 0), (len(self.parameters), 0)))
-            alone = replace(fit, jacobian=np.vstack([fit.jacobian[: len(fit.residual_V)], loose]))
-            # one error of the model is no smaller than the voltage at rest shows, beyond noise
-            start_V2 = float(fit.residual_V[0]) ** 2 - (MOST_NOISE_SD * (noise_V or 0.0)) ** 2 - self.mismatch_V**2
-            variance += len(fit.residual_V) * max(start_V2, 0.0) / (errors * error.noise_V) ** 2
+            knee_C = knee_sd_C(record, _model_V(record, fit), self.model.cell.VEOD) if error.drift_V else 0.0
+            fit = replace(fit, spread=search.spread(fit, priors, variance), knee_sd_C=knee_C)
+        # a settled estimate rests neither on a usual size, which nobody stated, nor on what goes together along a path
+        loose = np.pad(np.diag([1.0 / sd for sd in prior.nuisance.values()]), ((0, 0), (len(self.parameters), 0)))
+        alone = replace(fit, jacobian=np.vstack([fit.jacobian[:n], loose]))
+        variance += prior.more_variance(record, fit, error, noise_V)
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
-            carried = Prior("q_mobile", mean_C, self._sd_ratio * sqrt(variance) / sd_C)
+            carried = Prior("q_mobile", mean_C, prior.sd_ratio * sqrt(variance) / sd_C)
             fit = search.best([alone.values, *search.starts([mean_C])[0]], [*priors, carried])
             fit = replace(fit, spread=search.spread(fit, [*priors, carried], variance))
-        evidence = self._evidence(record, history, fit)
-        return _Fitted(search, fit, alone, variance, self._hidden_sd(search, fit, evidence.sd_charge_C), evidence)
-
-    def _evidence(self, record: Samples, history: ChargeHistory, fit: Fit) -> Evidence:
-        """What the samples of a record show, with a fit."""
-        estimate, soc = [fit.values[name] for name in PARAMETER_NAMES], self.initial_soc[0] if self._at_rest else None
-        return evidence_of(record, self.model.cell, soc, estimate, history, _model_V(record, fit))
+        estimate, soc = [fit.values[name] for name in PARAMETER_NAMES], self.initial_soc[0] if prior.starts_at_rest else None
+        evidence = evidence_of(record, self.model.cell, soc, estimate, history, _model_V(record, fit))
+        hidden_sd = self._hidden_sd(search, fit, evidence.sd_charge_C)
+        return RecordFit(record, history, search, fit, alone, variance, hidden_sd, evidence)
 
     def _hidden_sd(self, search: Search, fit: Fit, sd_charge_C: float) -> dict[str, float]:
         """
@@ -391,7 +345,7 @@ class LeastSquares(Estimator):
                 replace(search, model=RecordModel(model.cell, model.thermal, model.dt_s, initial_soc=each))
                 for each in (soc, soc + step)
             )
-            at_V = fit.residual_V if self._at_rest else at.residual(values)[0]
+            at_V = fit.residual_V if self.prior.starts_at_rest else at.residual(values)[0]
             moved = dict(values)
             if "q_mobile" in self.parameters:  # along with it, so that the cell ends as full as before
                 moved["q_mobile"] *= soc / (soc + step)
@@ -405,22 +359,24 @@ class LeastSquares(Estimator):
             for n, name in enumerate(self.parameters)
         }
 
-    def _resistance(self, record: Samples, history: ChargeHistory, fitted: _Fitted, fit: Fit) -> _Resistance:
+    def _resistance(self, fitted: RecordFit, fit: Fit) -> _Resistance:
         """The resistance after ten seconds of a fit; NaN where the record does not begin with a rest and a load that stays."""
-        step = load_on(record, history.at_rest) if self._at_rest and self.parameters == PARAMETER_NAMES else None
+        record, history = fitted.record, fitted.history
+        step = load_on(record, history.at_rest) if self.prior.starts_at_rest and self.parameters == PARAMETER_NAMES else None
         if step is None or not step.stays:
             return _Resistance()
         found = ModelResistance.of(record, step, fitted.search, fit)
         load_on_ohm = found.per_s * history.load_on_C / step.size_A
-        fit_ohm = self._sd_ratio * sqrt(fitted.variance) * found.sd_ohm
+        fit_ohm = self.prior.sd_ratio * sqrt(fitted.variance) * found.sd_ohm
         return _Resistance(found.ohm, hypot(fit_ohm, load_on_ohm, self.current_gain_sd * found.ohm), load_on_ohm)
 
-    def _differing(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> dict[str, float]:
+    def _differing(self, fitted: RecordFit) -> dict[str, float]:
         """What was measured of a load whose voltage falls otherwise than that of the model; nothing where both agree."""
+        record, history = fitted.record, fitted.history
         # constants that are held, and may be wrong, explain a difference as well
-        is_open = self.parameters == PARAMETER_NAMES and any(name in self.nuisance for name in RATE_CONSTANTS)
+        is_open = self.parameters == PARAMETER_NAMES and any(name in self.prior.nuisance for name in RATE_CONSTANTS)
         step = (load_on(record, history.at_rest) or later_step(record)) if is_open else None
-        model_V, root = _model_V(record, fitted.alone), self._sd_ratio * sqrt(fitted.variance)
+        model_V, root = _model_V(record, fitted.alone), self.prior.sd_ratio * sqrt(fitted.variance)
         for after_s in (PULSE_S, STEADY_S):  # what lags by less than these shows at one of them
             if step is None or not step.is_seen(record, after_s):
                 continue
@@ -436,8 +392,9 @@ class LeastSquares(Estimator):
                 return {**found, "apart_sd": apart_ohm / sd_ohm}
         return {}
 
-    def _verdict(self, record: Samples, history: ChargeHistory, fitted: _Fitted) -> Verdict:
+    def _verdict(self, fitted: RecordFit) -> Verdict:
         """What speaks against an estimate."""
+        record, history = fitted.record, fitted.history
         fit, alone, evidence, (soc, sd_soc) = fitted.fit, fitted.alone, fitted.evidence, self.initial_soc
         diagnosis = Diagnosis(evidence, evidence.measured(soc, float(record.time_s[0]), history.charge))
         n, free, is_stated = len(fit.residual_V), self.parameters, self.voltage_noise_V is not None
@@ -445,31 +402,34 @@ class LeastSquares(Estimator):
         diagnosis.note(Reason.FEW, not is_stated and n < len(free) + SPARE_SAMPLES)
         noise_V = self.voltage_noise_V or white_noise_V(fit.residual_V)
         # of a path the error is what its cells leave, and else what the drift allows for
-        drift_V = fitted.search.error.drift_V or self.mismatch_V
+        drift_V = fitted.search.error.drift_V or self.prior.mismatch_V
         diagnosis.note(Reason.MISFIT, square(fit.residual_V) > n * misfit_limit_V2(noise_V, n, drift_V, is_stated))
         q_mobile = fit.values["q_mobile"]
         diagnosis.note(Reason.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, self.model.cell.q_mobile))
-        if self.path is not None:
-            ratio = self.path.distance_sd(fit.values) / PATH_DISTANCE_LIMIT_SD
-            diagnosis.note(Reason.OTHER_KIND, ratio > 1.0, what="distance from the path of aging cells", ratio=ratio)
+        ratio = self.prior.distance_share(fit.values)
+        diagnosis.note(Reason.OTHER_KIND, ratio > 1.0, what="distance from the path of aging cells", ratio=ratio)
         moved = fit.square - alone.square
-        diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, moved > (self._sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance)
-        differing = self._differing(record, history, fitted)
+        is_far = moved > (self.prior.sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance
+        mean_C, sd_C = self.prior_q_mobile_C or (nan, nan)
+        expected_C = {"least_Ah": mean_C - PRIOR_LIMIT_SD * sd_C, "most_Ah": mean_C + PRIOR_LIMIT_SD * sd_C}
+        sizes_Ah = {name: size_C / 3600.0 for name, size_C in {"record_Ah": alone.values["q_mobile"], **expected_C}.items()}
+        diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, is_far, **sizes_Ah)
+        differing = self._differing(fitted)
         diagnosis.note(Reason.RESISTANCE_DIFFERS, bool(differing), **differing)
         for name in fit.at_bound:
             diagnosis.note_about(name, Reason.AT_BOUND)
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
-        resistance = self._resistance(record, history, fitted, alone)
+        resistance = self._resistance(fitted, alone)
         known = Assumptions(
             self.current_gain_sd,
             sd_soc / soc,
             knee_sd_C=alone.knee_sd_C,
             load_on_ohm=resistance.load_on_ohm,
-            is_along_path=self.path is not None,
+            is_along_path=isinstance(self.prior, PathPrior),
         )
         # where the record has it and where a prior has moved it: beside its knee the voltage says little of q_mobile
         moved_there = replace(alone, jacobian=np.vstack([fit.jacobian[:n], alone.jacobian[n:]]))
-        own_sds = [fitted.sd(each, {"q_mobile": self._sd_ratio}) for each in (alone, moved_there)]
+        own_sds = [fitted.sd(each, {"q_mobile": self.prior.sd_ratio}) for each in (alone, moved_there)]
         sds = {name: max(sd[name] for sd in own_sds) for name in free}
         if not isnan(resistance.ohm):
             sds["resistance_10s"] = resistance.sd_ohm
@@ -493,19 +453,3 @@ def _check_nuisance(nuisance: Mapping[str, float], parameters: tuple[str, ...]) 
     if "tDiffusion" in nuisance and "q_mobile" not in parameters:
         raise ValueError("tDiffusion can be a nuisance only beside q_mobile: without it the model cell may be empty too early")
     return dict(nuisance)
-
-
-def _starts_along(path: AgingPath, search: Search) -> list[dict[str, float]]:
-    """Where to start along a path: at what it expects of cells of some q_mobile, where the record allows for these."""
-    (mean, covariance), q = path.moments, PATH_NAMES.index("q_mobile")
-    log_least = float(np.log((1.0 + MARGIN) * search.least_q_C))
-    log_q = mean[q] + np.sqrt(covariance[q, q]) * np.array(_STARTS_SD)
-    starts = []
-    for each in np.unique(np.maximum(log_q, log_least + _START_ABOVE)):
-        expected = mean + covariance[q] / covariance[q, q] * (each - mean[q])
-        start = dict(zip(PATH_NAMES, expected.tolist(), strict=True))
-        start |= {name: float(np.exp(start[name])) for name in PARAMETER_NAMES}
-        # its constants may need more charge than those of the cell
-        start["q_mobile"] = max(start["q_mobile"], search.least_q_at_C(start)[0] * float(np.exp(_START_ABOVE)))
-        starts.append(start)
-    return starts

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from math import copysign, exp, inf, isnan, log, log1p, sqrt
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from battery_env.arrays import BoolArray, FloatArray, IntArray
@@ -18,19 +19,19 @@ from battery_env.electrochemistry.equilibrium import equilibrium_slopes, with_eq
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS, TANGENT_NAMES
 from battery_env.estimators.error import ErrorModel, VoltageError
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.records import Record, Samples, check_drawn_charge, drawn_charge_C
+from battery_env.records import Record, check_drawn_charge, drawn_charge_C
 from battery_env.records.model import RecordModel
 
 #: How far the search keeps from the least ``q_mobile``, as a share of it: more than rounding, less than anyone measures.
 MARGIN = 1e-6
 # The distance of q_mobile to its least value is below exp of this, so that no step of the search overflows.
 _LOG_LIMIT = 50.0
-# Logarithms of nuisance constants are held within this.
-_REACH = 5.0
+# Logarithms of nuisance constants are held within this, unless they have bounds.
+_REACHED = dict.fromkeys(RATE_CONSTANTS, (-5.0, 5.0))
 # A resistance that the search takes below zero has no logarithm.
 _LEAST = 1e-6
-# About so far apart, in the logarithm of q_mobile, are cells of one size.
-_SIZE_WIDTH = 0.2
+#: About so far apart, in the logarithm of q_mobile, are cells of one size.
+SIZE_WIDTH = 0.2
 _SCALES = {"q_mobile": 1.0, "r_o": 0.1}
 # Where the search for q_mobile may start: this much above its least value. The narrow ones serve whole discharges, the wide
 # ones the first minutes of one.
@@ -46,32 +47,6 @@ _STEP_SD = 0.5
 _STEPS = 100
 # How far the logarithm of a normal likelihood falls in a standard deviation.
 _FALL = 0.5
-
-
-def minimized(
-    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], start: FloatArray | list[float], **how: Any
-) -> FloatArray:
-    """Minimize the squares of residuals by scipy; ``evaluate`` gives them and their derivatives in one roll-out."""
-
-    @lru_cache(maxsize=1)  # scipy asks for them one after the other
-    def both(x: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
-        return evaluate(np.array(x))
-
-    def residual(x: FloatArray) -> FloatArray:
-        return both(tuple(x))[0]
-
-    def jacobian(x: FloatArray) -> FloatArray:
-        return both(tuple(x))[1]
-
-    return np.asarray(least_squares(residual, start, jac=jacobian, **how).x)
-
-
-def distance_C(log_distance: float) -> float:
-    """
-    Return the distance of ``q_mobile`` to the least value that a record allows. The search is over its logarithm: so every
-    simulation lasts as long as the record, and the knee of a discharge is nearly straight.
-    """
-    return float(np.exp(min(log_distance, _LOG_LIMIT)))
 
 
 @dataclass(frozen=True)
@@ -136,10 +111,10 @@ class SizePrior:
 
     def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """The residual, and its derivatives by all unknowns."""
-        distance = log(values["q_mobile"] / self.usual_C) / _SIZE_WIDTH
+        distance = log(values["q_mobile"] / self.usual_C) / SIZE_WIDTH
         residual = copysign(sqrt(log1p(distance**2)), distance)
         slope = distance / (1.0 + distance**2) / residual if residual else 1.0
-        row = np.array([[slope / (_SIZE_WIDTH * values["q_mobile"]) if name == "q_mobile" else 0.0 for name in unknown]])
+        row = np.array([[slope / (SIZE_WIDTH * values["q_mobile"]) if name == "q_mobile" else 0.0 for name in unknown]])
         return np.array([residual]), row
 
 
@@ -191,7 +166,7 @@ class Search:
     model: RecordModel
     parameters: tuple[str, ...]
     nuisance: Mapping[str, float]  # standard deviations of further unknowns
-    bounds: Mapping[str, tuple[float, float]]  # of both parameters; q_mobile is above its least value
+    bounds: Mapping[str, tuple[float, float]]  # of both parameters, and of constants; q_mobile is above its least value
     data: OnGrid
     least_q_C: float  # below it the model cell is empty before the record ends
     # by which residuals are weighed; of 1 V: they stay as they are
@@ -200,7 +175,7 @@ class Search:
     @classmethod
     def of(
         cls,
-        record: Samples,
+        record: Record,
         model: RecordModel,
         parameters: tuple[str, ...],
         nuisance: Mapping[str, float],
@@ -297,7 +272,7 @@ class Search:
     def _fit(self, start: dict[str, float], priors: Sequence[AnyPrior]) -> Fit:
         free, values = list(self.unknown), dict.fromkeys(self.nuisance, 0.0) | start
         while True:
-            values = self._minimized(values, free, priors)
+            (values,) = JointSearch([self], priors).minimized([values], free, method="lm", gtol=1e-10)
             bounds = self._bounds_at(values)
             clipped = {name: _within(values[name], bounds[name]) for name in free if name in bounds}
             inside = [name for name in free if clipped.get(name, values[name]) == values[name]]
@@ -320,7 +295,7 @@ class Search:
         column = self.unknown.index("q_mobile")
         best_C = fit.values["q_mobile"]
         least_C, _ = self.least_q_at_C(fit.values)
-        sd_C = sqrt(variance) * float(root_inverse_diagonal(fit.jacobian)[column])
+        sd_C = sqrt(variance) * float(standard_deviations(fit.jacobian)[column])
         if not 0.0 < sd_C < inf or fit.at_bound:
             return 1.0
         names = [name for name in self.unknown if name != "q_mobile"]
@@ -359,37 +334,36 @@ class Search:
         """Of all that has any; how slow the diffusion is moves the least ``q_mobile``."""
         (low_C, high_C), least_C = self.bounds["q_mobile"], self.least_q_at_C(values)[0]
         of_q_C = (max(low_C, (1.0 + MARGIN) * least_C), high_C)
-        return {**dict.fromkeys(RATE_CONSTANTS, (-_REACH, _REACH)), **self.bounds, "q_mobile": of_q_C}
+        return {**_REACHED, **self.bounds, "q_mobile": of_q_C}
 
-    def _minimized(self, start: dict[str, float], free: list[str], priors: Sequence[AnyPrior]) -> dict[str, float]:
-        unknown = self.unknown
-        columns = [unknown.index(name) for name in free]
+    def x_at(self, values: Mapping[str, float], free: Sequence[str]) -> list[float]:
+        """
+        The point of the search at some values. The search is over the logarithm of the distance of ``q_mobile`` to its least
+        value: so every simulation lasts as long as the record, and the knee of a discharge is nearly straight.
+        """
+        least_C, _ = self.least_q_at_C(values)
+        return [np.log(values[name] - least_C) if name == "q_mobile" else values[name] for name in free]
 
-        def values_at(x: Iterable[float]) -> tuple[dict[str, float], float, float]:
-            values = start | {name: float(value) for name, value in zip(free, x, strict=True)}
-            least_C, least_by_log_C = self.least_q_at_C(values)
-            if "q_mobile" in free:
-                values["q_mobile"] = least_C + distance_C(values["q_mobile"])
-            return values, least_C, least_by_log_C
+    def values_at(self, start: Mapping[str, float], x: Mapping[str, float]) -> tuple[dict[str, float], float, float]:
+        """Values at a point of the search, the least ``q_mobile`` there, and its slope by the logarithm of ``tDiffusion``."""
+        values = {**start, **x}
+        least_C, least_by_log_C = self.least_q_at_C(values)
+        if "q_mobile" in x:
+            values["q_mobile"] = least_C + float(np.exp(min(x["q_mobile"], _LOG_LIMIT)))
+        return values, least_C, least_by_log_C
 
-        def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            values, least_C, least_by_log_C = values_at(x)
-            residual, by_unknown = self.weighed(values, priors)
-            slopes = [values[name] - least_C if name == "q_mobile" else 1.0 for name in free]
-            by_x = by_unknown[:, columns] * slopes
-            if "q_mobile" in free and "tDiffusion" in free:  # which moves q_mobile along with its least value
-                by_x[:, free.index("tDiffusion")] += least_by_log_C * by_unknown[:, unknown.index("q_mobile")]
-            return residual, by_x
-
-        least_C, _ = self.least_q_at_C(start)
-        x = minimized(
-            evaluate,
-            [np.log(start[name] - least_C) if name == "q_mobile" else start[name] for name in free],
-            method="lm",
-            x_scale=[(_SCALES | dict(self.nuisance))[name] for name in free],
-            gtol=1e-10,
-        )
-        return values_at(x)[0]
+    def weighed_at(
+        self, start: Mapping[str, float], x: Mapping[str, float], priors: Sequence[AnyPrior]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residuals as of :meth:`weighed` at a point of the search, and their derivatives by its coordinates."""
+        values, least_C, least_by_log_C = self.values_at(start, x)
+        residual, by_unknown = self.weighed(values, priors)
+        unknown, free = self.unknown, list(x)
+        slopes = [values[name] - least_C if name == "q_mobile" else 1.0 for name in free]
+        by_x = by_unknown[:, [unknown.index(name) for name in free]] * slopes
+        if "q_mobile" in free and "tDiffusion" in free:  # which moves q_mobile along with its least value
+            by_x[:, free.index("tDiffusion")] += least_by_log_C * by_unknown[:, unknown.index("q_mobile")]
+        return residual, by_x
 
     @cached_property
     def error_at_samples(self) -> VoltageError:
@@ -431,7 +405,7 @@ class Search:
         constants = {}
         for name in self._rates:
             # a step of the search may go far, but explicit Euler is stable only for rates below 2 / dt
-            constant = getattr(cell, name) * float(np.exp(_within(values[name], (-_REACH, _REACH))))
+            constant = getattr(cell, name) * float(np.exp(_within(values[name], self.bounds.get(name, _REACHED[name]))))
             constants[name] = max(constant, self._least_stable(name))
         added_V = tuple(values[name] for name in EQUILIBRIUM_NAMES) if self._has_equilibrium else ()
         return _with_constants(self.model, tuple(constants.items()), added_V)
@@ -455,6 +429,79 @@ class Search:
         if "tDiffusion" not in self.nuisance:
             return self.least_q_C, 0.0
         return self.model_at(values).least_q_mobile_tangent_C(self.data.current_A)
+
+
+@dataclass(frozen=True)
+class JointSearch:
+    """
+    The search in one or more records, whose cells share all unknowns but their parameters. Its columns are the parameters of
+    the first record, those of the second one, and so on; and then what all share.
+    """
+
+    searches: Sequence[Search]  # of the same unknowns
+    priors: Sequence[AnyPrior]  # of what all share, and of the parameters of the first record
+
+    def residuals_V(self, values: Sequence[Mapping[str, float]]) -> list[FloatArray]:
+        """The residuals of each record, V."""
+        return [search.residual(at)[0] for search, at in zip(self.searches, values, strict=True)]
+
+    def weighed(self, values: Sequence[Mapping[str, float]]) -> tuple[FloatArray, FloatArray]:
+        """The residuals of all records as they are weighed, those of the priors among them, and their derivatives."""
+        each = enumerate(zip(self.searches, values, strict=True))
+        parts = [search.weighed(at, () if n else self.priors) for n, (search, at) in each]
+        return _stacked(parts, len(self.searches[0].parameters))
+
+    def minimized(
+        self,
+        starts: Sequence[Mapping[str, float]],
+        free: Sequence[str],
+        limits: Mapping[str, tuple[float, float]] | None = None,
+        **how: Any,
+    ) -> list[dict[str, float]]:
+        """
+        Minimize the squares of the residuals.
+
+        :param starts: values of all unknowns of each record
+        :param free: the unknowns that may change, in the order of :attr:`Search.unknown`
+        :param limits: of these, as the search has them; ``None``: there are none
+        :param how: further arguments of scipy's ``least_squares``
+        :return: the values of each record
+        """
+        first, count = self.searches[0], len(self.searches)
+        own = sum(name in first.parameters for name in free)
+        names, scales = [*count * list(free[:own]), *free[own:]], {**_SCALES, **first.nuisance}
+        points = [search.x_at(start, free) for search, start in zip(self.searches, starts, strict=True)]
+        x0 = np.concatenate([*(point[:own] for point in points), points[0][own:]])
+        if limits is not None:
+            low, high = np.array([limits[name] for name in names]).T
+            room = MARGIN * (high - low)
+            how["bounds"], x0 = (low, high), np.clip(x0, low + room, high - room)
+
+        def of_each(x: FloatArray) -> list[dict[str, float]]:
+            rows = x[: count * own].reshape(count, own)
+            return [dict(zip(free, [*row.tolist(), *x[count * own :].tolist()], strict=True)) for row in rows]
+
+        @lru_cache(maxsize=1)  # scipy asks for residuals and derivatives one after the other
+        def both(x: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+            each = enumerate(zip(self.searches, starts, of_each(np.array(x)), strict=True))
+            parts = [search.weighed_at(start, at, () if n else self.priors) for n, (search, start, at) in each]
+            return _stacked(parts, own)
+
+        def residual(x: FloatArray) -> FloatArray:
+            return both(tuple(x))[0]
+
+        def jacobian(x: FloatArray) -> FloatArray:
+            return both(tuple(x))[1]
+
+        best = least_squares(residual, x0, jacobian, x_scale=[scales[name] for name in names], **how)
+        found = zip(self.searches, starts, of_each(best.x), strict=True)
+        return [search.values_at(start, at)[0] for search, start, at in found]
+
+
+def _stacked(parts: Sequence[tuple[FloatArray, FloatArray]], own: int) -> tuple[FloatArray, FloatArray]:
+    """Residuals of all records, and their derivatives, of which each record has so many first columns for itself."""
+    of_each, shared = block_diag(*(rows[:, :own] for _, rows in parts)), np.vstack([rows[:, own:] for _, rows in parts])
+    return np.concatenate([residual for residual, _ in parts]), np.hstack([of_each, shared])
 
 
 @lru_cache(maxsize=4)  # it is asked for several times at each step of a search
@@ -483,20 +530,23 @@ def square(array: FloatArray) -> float:
     return float(array @ array)
 
 
-def root_inverse_diagonal(jacobian: FloatArray) -> FloatArray:
-    """The roots of the diagonal of (J^T J)^-1; infinite where the data do not determine the parameters."""
+def covariance(jacobian: FloatArray) -> FloatArray:
+    """(J^T J)^-1: of the unknowns, of residuals whose variance is one; infinite where the data do not determine them."""
     try:
-        return np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+        return np.asarray(np.linalg.inv(jacobian.T @ jacobian))
     except np.linalg.LinAlgError:
-        return np.full(jacobian.shape[1], np.inf)
+        return np.full((jacobian.shape[1], jacobian.shape[1]), np.inf)
+
+
+def standard_deviations(jacobian: FloatArray) -> FloatArray:
+    """The roots of the diagonal of :func:`covariance`."""
+    return np.asarray(np.sqrt(np.diag(covariance(jacobian))))
 
 
 def root_variance(jacobian: FloatArray, row: FloatArray) -> float:
-    """The root of row (J^T J)^-1 row^T, the variance of a linear function of the parameters; infinite as above."""
-    try:
-        return sqrt(max(float(row @ np.linalg.inv(jacobian.T @ jacobian) @ row), 0.0))
-    except np.linalg.LinAlgError:
-        return inf
+    """The standard deviation of a linear function of the unknowns; infinite where the data do not determine them."""
+    variance = float(row @ covariance(jacobian) @ row)
+    return inf if isnan(variance) else sqrt(max(variance, 0.0))
 
 
 def _within(value: float, limits: tuple[float, float]) -> float:

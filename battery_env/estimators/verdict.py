@@ -94,10 +94,11 @@ class Diagnosis:
             self._against.append(_Against(reason))
             self._measured = measured | self._measured
 
-    def note_about(self, number: str, reason: Reason, holds: bool = True) -> None:
+    def note_about(self, number: str, reason: Reason, holds: bool = True, /, **measured: Any) -> None:
         """The same of one that names one number."""
         if holds:
             self._against.append(_Against(reason, number))
+            self._measured = measured | self._measured
 
     def verdict(
         self,

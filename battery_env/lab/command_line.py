@@ -1,6 +1,6 @@
 """
-The command line: what records of discharges say about their cells, when one in progress ends, how constants are found, and a
-page that shows all of it.
+The command line: calibrate discharges, forecast the end of one in progress, fit the constants of a cell, and show all of it
+on a page.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import re
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,7 +31,7 @@ from battery_env.lab.readers.columns import FileFormat, recognise
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.readers.testers import find_tester, tester_file
 from battery_env.lab.report import Calibration, change_of, line_of, text_of
-from battery_env.lab.settings import METHODS, Settings
+from battery_env.lab.settings import METHODS, Settings, SettingsOptions
 from battery_env.lab.sources import VOLTAGE, Source, few_of, find_sources, read_source
 from battery_env.loads import constant
 from battery_env.records import CUT_OFF_V
@@ -40,7 +39,7 @@ from battery_env.records.discharge import Discharge
 from battery_env.records.refusals import Advice, Origin, RecordError
 from battery_env.records.samples import check_cut_off
 
-#: What the process returns: all records settled, one or more refused, one or more not settled, stopped, nobody reads on.
+#: Exit statuses: all records settled, some refused, some not settled, interrupted, the reader of a pipe left.
 SETTLED, REFUSED, NOT_SETTLED, INTERRUPTED, PIPE_CLOSED = 0, 2, 3, 130, 141
 
 _NAME = "battery-calibrate"
@@ -49,24 +48,26 @@ _ASSIGNMENTS = re.compile(r",\s*(?=\w+=)")
 
 
 class _Assignments(argparse.Action):
-    """Options of the form quantity=NAME,quantity=NAME, which may be given several times, but say one thing of a quantity."""
+    """Options of the form quantity=NAME,quantity=NAME, which may be repeated, with one value for each quantity."""
 
     def __call__(self, _parser: Any, namespace: argparse.Namespace, text: Any, _option: str | None = None) -> None:
-        told = dict(getattr(namespace, self.dest) or {})
-        for name, equals, value in (part.partition("=") for part in _ASSIGNMENTS.split(text)):
+        assignments = dict(getattr(namespace, self.dest) or {})
+        for name, equals, value in (assignment.partition("=") for assignment in _ASSIGNMENTS.split(text)):
             quantity, value = name.strip(), value.strip()
             if not (quantity and equals and value):
                 raise argparse.ArgumentError(self, f"expected quantity=NAME,quantity=NAME, got {text!r}")
-            if told.setdefault(quantity, value) != value:
-                raise argparse.ArgumentError(self, f"the {quantity} cannot be both {told[quantity]!r} and {value!r}: give one")
-        setattr(namespace, self.dest, told)
+            if assignments.setdefault(quantity, value) != value:
+                raise argparse.ArgumentError(
+                    self, f"the {quantity} cannot be both {assignments[quantity]!r} and {value!r}: give one"
+                )
+        setattr(namespace, self.dest, assignments)
 
 
 def _initial_soc(text: str) -> InitialSoc | Literal["rest"]:
     if text == "rest":
         return "rest"
     try:
-        numbers = [float(part) for part in text.split(",")]
+        numbers = [float(number) for number in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in (1, 2):
@@ -84,7 +85,7 @@ def _drawn(text: str) -> tuple[list[float], list[float], str]:
     return load.start_s.tolist(), load.value.tolist(), load.unit
 
 
-# What help begins with, before all options.
+# The start of the help.
 _FIRST = """\
 q_max (the charge that can move), resistance, health and the end of discharges, each from a full cell at rest.
 
@@ -99,11 +100,11 @@ examples:
 
 
 def _parser() -> argparse.ArgumentParser:
-    others = "\n".join(f"  {_NAME} {name:<10}{what}" for name, (_, what) in _COMMANDS.items() if name != "calibrate")
+    commands = "\n".join(f"  {_NAME} {name:<10}{what}" for name, (_, what) in _COMMANDS.items() if name != "calibrate")
     parser = argparse.ArgumentParser(
         prog=_NAME,
         usage=f"{_NAME} FILE [FILE ...] [options]\n       {_NAME} B0005:100, for example; --help has more",
-        description=_FIRST.format(others),
+        description=_FIRST.format(commands),
         epilog="Exit status: 0 if every discharge is settled, 3 if one is not, 2 if one cannot be used.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
@@ -117,7 +118,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=METHODS,
         help="of calibration: least squares, or the policy that comes with the package (default: least squares)",
     )
-    _add_calibration(group)
+    _add_settings(group)
     group = parser.add_argument_group("results")
     group.add_argument(
         "--out", type=Path, metavar="DIR", help="write the table of estimates, the voltages and figures there, for one run"
@@ -193,7 +194,7 @@ def _forecast_parser() -> argparse.ArgumentParser:
         help="the load to come: time_s, from 0 at the last sample under load, and current_A or power_W, each held until the "
         "next (default: as so far)",
     )
-    _add_calibration(parser.add_argument_group("calibration"))
+    _add_settings(parser.add_argument_group("calibration"))
     group = parser.add_argument_group("results")
     group.add_argument("--out", type=Path, metavar="DIR", help="write a figure there, NAME_forecast.png; it may not exist")
     group.add_argument("--json", action="store_true", help="print one JSON object")
@@ -207,7 +208,7 @@ _FILE_HELP = (
 
 
 def _add_reading(parser: argparse.ArgumentParser) -> None:
-    """The options of all commands that read files."""
+    """Add the options of all commands that read files."""
     group = parser.add_argument_group("reading")
     group.add_argument(
         "--columns",
@@ -248,52 +249,45 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_calibration(group: Any) -> None:
-    """Arguments of :class:`Settings`, whose defaults hold where none is given."""
-    group.add_argument(
-        "--cut-off",
-        dest="cut_off_V",
-        type=float,
-        metavar="V",
-        help="voltage at which the discharge ends, V (default: 2.7, or that of the fit of --cell)",
-    )
-    group.add_argument(
-        "--prior",
-        dest="prior_q_mobile_C",
-        nargs=2,
-        type=float,
-        metavar=("MEAN", "SD"),
-        help="q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
-    )
-    group.add_argument(
-        "--initial-soc",
-        type=_initial_soc,
-        metavar="SOC",
-        help="state of charge when the load is switched on, after a rest: 0.8; with its standard deviation 0.8,0.02; or rest: "
-        "told from the voltage of a minute or more at rest before the load (default: 1, a full cell)",
-    )
-    group.add_argument(
-        "--mismatch",
-        dest="mismatch_V",
-        type=float,
-        metavar="V",
-        help="error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
-    )
-    group.add_argument(
-        "--cell",
-        type=Path,
-        metavar="FILE",
-        help="constants of the cell, as the command fit saves them, or CellParameters.to_json; or how cells of its kind age, "
-        "as fit_life finds it and AgingPath.to_json saves it (default: those of a new 18650)",
-    )
-    group.add_argument(
-        "--nominal",
-        dest="nominal_Ah",
-        type=float,
-        metavar="AH",
-        help="nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this "
-        "load); it also tells what to expect of a cell in progress that is below 1 or above 4 Ah",
-    )
+# Options of the settings, with the names of their values: the setting, the type of a value, and the help.
+_SETTINGS: Mapping[str, tuple[str, Callable[[str], Any], str]] = {
+    "--cut-off V": ("cut_off_V", float, "voltage at which the discharge ends, V (default: 2.7, or that of the fit of --cell)"),
+    "--prior MEAN SD": (
+        "prior_q_mobile_C",
+        float,
+        "q_mobile as known from an earlier discharge, C; while a discharge is in progress the estimate rests on it",
+    ),
+    "--initial-soc SOC": (
+        "initial_soc",
+        _initial_soc,
+        "state of charge when the load is switched on, after a rest: 0.8; with its standard deviation 0.8,0.02; or rest: told "
+        "from the voltage of a minute or more at rest before the load (default: 1, a full cell)",
+    ),
+    "--mismatch V": (
+        "mismatch_V",
+        float,
+        "error to expect of the model itself, V; 0 for simulated data (default: 0.05, or that of the fit of --cell)",
+    ),
+    "--cell FILE": (
+        "cell",
+        Path,
+        "constants of the cell, as the command fit saves them, or CellParameters.to_json; or how cells of its kind age, as "
+        "fit_life finds it and AgingPath.to_json saves it (default: those of a new 18650)",
+    ),
+    "--nominal AH": (
+        "nominal_Ah",
+        float,
+        "nominal capacity, Ah, which the state of health refers to (default: what the cell of --cell gives at this load); it "
+        "also tells what to expect of a cell in progress that is below 1 or above 4 Ah",
+    ),
+}
+
+
+def _add_settings(group: Any) -> None:
+    for form, (setting, read, text) in _SETTINGS.items():
+        option, *values = form.split()
+        count = len(values) if len(values) > 1 else None
+        group.add_argument(option, dest=setting, type=read, nargs=count, metavar=tuple(values), help=text)
 
 
 def calibrate(arguments: Sequence[str] | None = None) -> int:
@@ -301,19 +295,19 @@ def calibrate(arguments: Sequence[str] | None = None) -> int:
     The command ``battery-calibrate``, and the others by their names behind it. Errors are a line, an interruption another, and
     a closed pipe none; each has its exit status.
     """
-    given = sys.argv[1:] if arguments is None else list(arguments)
+    words = sys.argv[1:] if arguments is None else list(arguments)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a console that has not all characters shows their numbers
+        if isinstance(stream, io.TextIOWrapper):  # a console without some character shows an escape
             stream.reconfigure(errors="backslashreplace")
-    name = given.pop(0) if given and given[0] in _COMMANDS else "calibrate"
+    name = words.pop(0) if words and words[0] in _COMMANDS else "calibrate"
     try:
         with interruptible():
-            status = _COMMANDS[name][0](given)
+            status = _COMMANDS[name][0](words)
             sys.stdout.flush()
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # head, or a pager that was left
+    except BrokenPipeError:  # closed by head or a pager
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still to be flushed
         return PIPE_CLOSED
     except (ValueError, TypeError, OSError, ImportError) as error:
@@ -323,13 +317,13 @@ def calibrate(arguments: Sequence[str] | None = None) -> int:
 
 
 def _calibrate(arguments: Sequence[str]) -> int:
-    """What discharges say; the exit status says whether all are settled."""
-    if arguments and not Path(arguments[0]).exists() and (meant := get_close_matches(arguments[0], _COMMANDS, 1)):
-        raise ValueError(f"no command and no file {arguments[0]!r}: did you mean {_NAME} {meant[0]}?")
+    """Calibrate discharges; the exit status is that of the least settled one."""
+    if arguments and not Path(arguments[0]).exists() and (similar := get_close_matches(arguments[0], _COMMANDS, 1)):
+        raise ValueError(f"no command and no file {arguments[0]!r}: did you mean {_NAME} {similar[0]}?")
     options = _parser().parse_args(arguments)
     settings = _settings(options)
-    settings.calibrator()  # what it refuses it refuses of every file
-    with _saying():
+    settings.calibrator()  # settings that it refuses are wrong for every file
+    with _printing_warnings():
         sources = find_sources(options.records)
     file_format = _file_format(options)
     if options.out is None:
@@ -352,18 +346,20 @@ def _calibrate_all(
     last_settled: Calibration | None = None
     first: Outcome | None = None
     is_interrupted = False
-    if results and results.spoiled:
-        said = "lines are not as they were written, and are left out"
-        print(f"warning: {results.run}: {results.spoiled} {said}", file=sys.stderr)
-    if results and (done := len(results.done)):
+    if results and results.damaged:
+        problem = "lines are not as they were written, and are left out"
+        print(f"warning: {results.run}: {results.damaged} {problem}", file=sys.stderr)
+    if results and (count_done := len(results.done)):
         absent = f", {results.absent} of them of files that are not there now" if results.absent else ""
-        print(f"going on: {done} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True)
+        print(f"going on: {count_done} discharges are done, as {results.run} says{absent}", file=sys.stderr, flush=True)
     try:
-        with workers(options.jobs, options.scheduler) as executor, announce_compilation():
-            ahead = 64 if options.scheduler or options.jobs < 1 else 2 * options.jobs
-            for outcome in calibrate_all(sources, file_format, settings, results, executor, ahead):
+        is_serial = options.jobs == 1 and options.scheduler is None
+        side_by_side = nullcontext() if is_serial else workers(options.jobs, options.scheduler)
+        with side_by_side as executor, announce_compilation():
+            most_waiting = 64 if options.scheduler or options.jobs < 1 else 2 * options.jobs
+            for outcome in calibrate_all(sources, file_format, settings, results, executor, most_waiting):
                 _report(outcome, options.json)
-                if first is not None and not options.json:  # the only one is printed in full
+                if first is not None and not options.json:  # a single discharge is printed in full
                     for each in (first, outcome) if states.total() == 1 else (outcome,):
                         _print_line(each)
                 first = first or outcome
@@ -376,13 +372,13 @@ def _calibrate_all(
         is_interrupted = True
     finally:
         if results:
-            with _saying():
+            with _printing_warnings():
                 results.write_tables()
     if not options.json:
         if states.total() > 1:
             counts = ", ".join(f"{states[state]} {state}" for state in ("settled", "not settled", "refused"))
             print(f"\n{states.total()} discharges: {counts}")
-            is_one_cell = len(cells) in (1, states.total())  # a file each is one cell's, as in life.png
+            is_one_cell = len(cells) in (1, states.total())  # a cell, or one file for each discharge, as in life.png
             if is_one_cell and first_settled and last_settled and last_settled is not first_settled:
                 change = change_of(first_settled, last_settled)
                 print(f"{change}, {states['settled']} of {states.total()} settled")
@@ -415,19 +411,19 @@ def _file_format(options: argparse.Namespace) -> FileFormat:
 
 
 def _settings(options: argparse.Namespace) -> Settings:
-    names = {field.name for field in fields(Settings)} - {"cell"}
-    given: dict[str, Any] = {
+    """The settings that were stated; the default of a setting holds where its option is not given."""
+    stated: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in vars(options).items()
-        if name in names and value is not None
+        if name in SettingsOptions.__annotations__ and value is not None
     }
-    with _saying(), _naming(options):
-        return Settings.for_file(options.cell, **given)
+    with _printing_warnings(), _with_command(options):
+        return Settings.for_file(stated.pop("cell", None), **stated)
 
 
 @contextmanager
-def _naming(options: argparse.Namespace) -> Iterator[None]:
-    """Show the command that mends an option, of the first file that the command line names."""
+def _with_command(options: argparse.Namespace) -> Iterator[None]:
+    """Let an error show the command that mends an option, for the first file of the command line."""
     try:
         yield
     except RecordError as error:
@@ -435,36 +431,36 @@ def _naming(options: argparse.Namespace) -> Iterator[None]:
 
 
 def _fit(arguments: Sequence[str]) -> int:
-    """The command ``fit``; its exit status is 3 if there is doubt about the fit."""
+    """The command ``fit``; its exit status is 3 for a doubtful fit."""
     options = _fit_parser().parse_args(arguments)
     out: Path = options.out
     picture = out.with_name(f"{out.stem}_fit.png")
     if out.suffix != ".json":
         raise ValueError(f"the fit is written as JSON: --out {out.name}.json instead of {out.name}")
     check_new(out, picture)
-    with _naming(options):
+    with _with_command(options):
         check_cut_off(options.cut_off)
     discharges = _discharges(options.records, _file_format(options))
     print(f"fitting {len(discharges)} discharges", file=sys.stderr, flush=True)
     with warnings.catch_warnings(), announce_compilation():
-        warnings.simplefilter("ignore", UserWarning)  # of the doubt, which is printed
-        found = fit_cell(discharges, options.cut_off)
-    print(found.summary())
-    if found.doubt:
-        print(f"warning: {found.doubt}", file=sys.stderr)
-    found.to_json(out)
+        warnings.simplefilter("ignore", UserWarning)  # the doubt is printed below
+        fit = fit_cell(discharges, options.cut_off)
+    print(fit.summary())
+    if fit.doubt:
+        print(f"warning: {fit.doubt}", file=sys.stderr)
+    fit.to_json(out)
 
     from battery_env.plotting import plot_cell_fit, save_figure  # here, as matplotlib takes long to import
 
-    # so many fit beside each other
-    shown = [discharges[n] for n in spread_over(len(discharges), 4)]
-    save_figure(plot_cell_fit(found, shown), picture)
+    # four discharges fit into a figure
+    examples = [discharges[n] for n in spread_over(len(discharges), 4)]
+    save_figure(plot_cell_fit(fit, examples), picture)
     print(f"\nwritten: {out}, {picture}")
-    return NOT_SETTLED if found.doubt else SETTLED
+    return NOT_SETTLED if fit.doubt else SETTLED
 
 
 def _forecast(arguments: Sequence[str]) -> int:
-    """The command ``forecast``; its exit status is 3 if something in the record contradicts the estimate."""
+    """The command ``forecast``; its exit status is 3 if the record contradicts the estimate."""
     options = _forecast_parser().parse_args(arguments)
     from battery_env.lab.running import end_of_record, figure_of  # here, as matplotlib takes long to import
 
@@ -474,7 +470,7 @@ def _forecast(arguments: Sequence[str]) -> int:
     figure = figure_of(options.record, options.out) if options.out else None
     if figure:
         check_new(figure)
-    with _saying(), announce_compilation():
+    with _printing_warnings(), announce_compilation():
         end = end_of_record(options.record, settings, file_format, options.life, options.load)
     print(json.dumps(end.row()) if options.json else end.text())
     if figure:
@@ -512,19 +508,19 @@ def _columns(arguments: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, default=Path("my_tester.toml"), metavar="FILE.toml", help="default: %(default)s")
     options = parser.parse_args(arguments)
     check_new(options.out)
-    with _saying():
-        opened = open_file(options.record, FileFormat())
-        found = recognise(opened.names, FileFormat(), opened.rows)
-    print("\n".join(found.lines()))
-    with replacing(options.out, new=True) as part:
-        part.write_text(tester_file(found.columns, opened.names, opened.rows), encoding="utf-8")
-    then = "Fill in what is not found" if found.missing else "Change what is wrong"
-    command = Origin(str(options.record)).command(Advice(then, "tester", options.out))
-    print(f"\nwritten: {options.out}. {then}, and calibrate: {command}")
-    return NOT_SETTLED if found.missing else SETTLED
+    with _printing_warnings():
+        table = open_file(options.record, FileFormat())
+        columns = recognise(table.names, FileFormat(), table.rows)
+    print("\n".join(columns.lines()))
+    with replacing(options.out, new=True) as file:
+        file.write_text(tester_file(columns.columns, table.names, table.rows), encoding="utf-8")
+    task = "Fill in what is not found" if columns.missing else "Change what is wrong"
+    command = Origin(str(options.record)).command(Advice(task, "tester", options.out))
+    print(f"\nwritten: {options.out}. {task}, and calibrate: {command}")
+    return NOT_SETTLED if columns.missing else SETTLED
 
 
-# The commands, with what they are for.
+# The commands, with their purposes.
 _COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
     "calibrate": (_calibrate, "capacity and resistance of cells from their discharges"),
     "forecast": (_forecast, "the end of a discharge in progress"),
@@ -535,8 +531,8 @@ _COMMANDS: dict[str, tuple[Callable[[list[str]], int], str]] = {
 
 
 @contextmanager
-def _saying(name: str = "") -> Iterator[None]:
-    """Prints the warnings of what is done within."""
+def _printing_warnings(name: str = "") -> Iterator[None]:
+    """Print the warnings of the block."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")  # those for developers
         warnings.simplefilter("always", UserWarning)
@@ -548,12 +544,12 @@ def _saying(name: str = "") -> Iterator[None]:
 
 
 def _discharges(records: Sequence[str], file_format: FileFormat) -> list[Discharge]:
-    """All that the arguments name, each with the name of its file and the number that it is shown by."""
+    """Read the discharges of all arguments, each with the name of its file and its number."""
     discharges = []
-    with _saying():
+    with _printing_warnings():
         sources = find_sources(records)
     for source in sources:
-        with _saying(f"{source.argument}: "):
+        with _printing_warnings(f"{source.argument}: "):
             try:
                 recordings = read_source(source, file_format)
                 if len(cells := {str(each.meta.get("cell")) for each in recordings}) > 1:

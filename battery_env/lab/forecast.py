@@ -1,4 +1,4 @@
-"""When a cell will be discharged under the load to come, and how sure that is."""
+"""The end of discharge under a load to come, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 # The last voltage of a record may be the cut-off but for rounding, V.
 _ROUNDING_V = 1e-6
-# The capacity of a new cell under a random load is the mean of so many draws, which makes it sure to 1 %.
+# Draws of a random load for the capacity of a new cell: their mean has a standard error of 1 %.
 _NOMINAL_DRAWS = 100
 # An estimate this many standard deviations below what the record takes out of the cell contradicts the record.
 _CONTRADICTION_SD = 5.0
-# A figure goes on for at most this many times the record, or its expected end.
-_LONGEST_SHOWN = 1.5
+# A figure ends at most at this multiple of the record, or of its median end.
+_LONGEST_PLOTTED = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +132,8 @@ class Forecast:
         inside = f"{100.0 * (BAND[2] - BAND[0]):.0f} %"
         time_s, voltage_V, end_s = self.time_s, self.voltage_V, self.eod_quantile_s()
         if np.isfinite(end_s).all():
-            # an end that may be far away would leave no room for what was seen
-            last_s = min(end_s[2], _LONGEST_SHOWN * max(self.now_s, end_s[1]))
+            # a distant end would leave no room for the record
+            last_s = min(end_s[2], _LONGEST_PLOTTED * max(self.now_s, end_s[1]))
             axes.axvspan(min(end_s[0], last_s), last_s, color=COLOURS[1], alpha=0.2, lw=0, label=f"end of discharge, {inside}")
             axes.axvline(end_s[1], color=COLOURS[1], lw=1.2)
             time_s, voltage_V = time_s[time_s <= last_s], voltage_V[:, time_s <= last_s]
@@ -147,7 +147,7 @@ class Forecast:
 
 
 def decimals(value: float, least: int) -> int:
-    """So many digits behind the point that three digits of a value show, also of a small cell's."""
+    """Return the number of decimals that shows three digits of a value, also for a small cell."""
     return max(least, 2 - floor(log10(value))) if 0.0 < value < inf else least
 
 
@@ -204,18 +204,18 @@ def forecast(
     model = RecordModel(NEW_CELL.replace(VEOD=CUT_OFF_V)) if model is None else model
     cut_off = model.cell.VEOD if cut_off_V is None else cut_off_V
     _check_arguments(mismatch_V, cut_off, nominal_Ah, samples, seed)
-    seen = check_record(record, least_samples=2)
-    rng, new = np.random.default_rng(seed), model
-    ahead, load_name = _to_come(load, load_unit, seen, model)
-    notes = _notes(estimate, seen, load is None and isinstance(ahead, RandomLoad))
+    measured = check_record(record, least_samples=2)
+    rng, new_model = np.random.default_rng(seed), model
+    future_load, load_name = _future_load(load, load_unit, measured, model)
+    notes = _notes(estimate, measured, load is None and isinstance(future_load, RandomLoad))
 
     model = model.at(estimate)
-    _, current_A = model.grid(seen)
+    _, current_A = model.grid(measured)
     q_C, r_ohm, acting_ohm = _draw_parameters(model, current_A[:-1], estimate, mismatch_V, samples, rng)
-    cells, voltage_V = _at_the_end_of(seen, model, current_A, (q_C, acting_ohm), mismatch_V, rng)
+    cells, voltage_V = _cells_at_the_end(measured, model, current_A, (q_C, acting_ohm), mismatch_V, rng)
     reached_V = cut_off + _ROUNDING_V
-    over = seen.voltage_V[-1] <= reached_V and seen.current_A[-1] > 0.0
-    if not over:
+    has_ended = measured.voltage_V[-1] <= reached_V and measured.current_A[-1] > 0.0
+    if not has_ended:
         alive = np.flatnonzero(voltage_V + cells.error_V > cut_off)
         if len(alive) == 0:
             raise ValueError(
@@ -226,24 +226,23 @@ def forecast(
             notes.append(f"The record contradicts {1.0 - len(alive) / samples:.0%} of what the estimate takes to be possible.")
         chosen = np.where(np.isin(np.arange(samples), alive), np.arange(samples), rng.choice(alive, size=samples))
         cells, r_ohm = cells.select(chosen), r_ohm[chosen]
-    # the first draw is that of the new cell alone
-    draws = _draws(ahead, samples + 1, rng) if isinstance(ahead, RandomLoad) else [ahead]
-    if over:
-        given_Ah = (1.0 - cells.soc) * cells.q_mobile / 3600.0
-        ends = EndsOfDischarge(np.zeros(samples), given_Ah, np.zeros(1), np.full((len(BAND), 1), cut_off))
-        above = np.flatnonzero(seen.voltage_V > reached_V)
+    # the first draw is for the capacity of the new cell alone
+    draws = _drawn_loads(future_load, samples + 1, rng) if isinstance(future_load, RandomLoad) else [future_load]
+    if has_ended:
+        capacity_Ah = (1.0 - cells.soc) * cells.q_mobile / 3600.0
+        ends = EndsOfDischarge(np.zeros(samples), capacity_Ah, np.zeros(1), np.full((len(BAND), 1), cut_off))
+        above = np.flatnonzero(measured.voltage_V > reached_V)
         around = [above[-1] + 1, above[-1]] if len(above) else [0]
-        now_s = float(np.interp(cut_off, seen.voltage_V[around], seen.time_s[around]))
+        now_s = float(np.interp(cut_off, measured.voltage_V[around], measured.time_s[around]))
     else:
-        now_s = float(seen.time_s[-1])
+        now_s = float(measured.time_s[-1])
         ends = simulate_to_cut_off(cells, model, draws[-samples:], cut_off, every_s=10.0)
     if nominal_Ah is None:
-        # the mean over loads, sure to 1 %: under a single draw, health would be a matter of that draw. No charge takes a cell
-        # to its end
-        given_Ah = new.capacity_Ah(draws[:_NOMINAL_DRAWS], cut_off)
-        nominal_Ah = float(given_Ah[given_Ah > 0.0].mean()) if (given_Ah > 0.0).any() else float("nan")
+        # the mean over draws, as the state of health must not depend on a single draw; a draw that only charges has no end
+        new_Ah = new_model.capacity_Ah(draws[:_NOMINAL_DRAWS], cut_off)
+        nominal_Ah = float(new_Ah[new_Ah > 0.0].mean()) if (new_Ah > 0.0).any() else float("nan")
     return Forecast(
-        record=seen,
+        record=measured,
         load_name=load_name,
         cut_off_V=float(cut_off),
         eod_time_s=now_s + ends.time_s,
@@ -288,10 +287,10 @@ def _notes(estimate: Estimate, record: Samples, goes_on_varied: bool) -> list[st
     return notes
 
 
-def _to_come(
+def _future_load(
     load: LoadToCome | None, unit: LoadUnit, record: Samples, model: RecordModel
 ) -> tuple[KnownLoad | RandomLoad, str]:
-    """The load to come, and its name."""
+    """Return the load to come, and its name."""
     if load is None:
         expected = expected_current(record.time_s, record.current_A)
         if expected.is_varying:
@@ -299,18 +298,18 @@ def _to_come(
         load, unit = expected.mean_A, "current"
     if isinstance(load, RandomLoad):
         return load, "a random load"
-    known = known_load(load, unit)
+    future_load = known_load(load, unit)
     if isinstance(load, (Load, Cycle)):
-        return known, "a cycle" if isinstance(load, Cycle) else "a given load"
-    return known, "a given load" if callable(load) else f"{load:g} {LOAD_UNIT_SYMBOLS[unit]}"
+        return future_load, "a cycle" if isinstance(load, Cycle) else "a given load"
+    return future_load, "a given load" if callable(load) else f"{load:g} {LOAD_UNIT_SYMBOLS[unit]}"
 
 
-def _draws(load: RandomLoad, count: int, rng: np.random.Generator) -> list[KnownLoad]:
+def _drawn_loads(load: RandomLoad, count: int, rng: np.random.Generator) -> list[KnownLoad]:
     name, draws = type(load).__name__, [load(rng) for _ in range(count)]
-    others = [drawn for drawn in draws if not isinstance(drawn, KnownLoad)]
-    if others:
+    unsuitable = [drawn for drawn in draws if not isinstance(drawn, KnownLoad)]
+    if unsuitable:
         raise TypeError(
-            f"a draw of {name} must be a load of battery_env.loads, such as a Load or a Cycle, got {others[0]!r}. Lay a "
+            f"a draw of {name} must be a load of battery_env.loads, such as a Load or a Cycle, got {unsuitable[0]!r}. Lay a "
             "function of time out: Load(time_s, function(time_s), unit)."
         )
     units = sorted({drawn.unit for drawn in draws})
@@ -327,7 +326,7 @@ def _draw_parameters(
     samples: int,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Both parameters, and the resistance that acts under other loads: it holds the whole error of the model."""
+    """Draw both parameters, and the resistance under other loads, which includes the whole error of the model."""
     q_C, r_ohm = float(Q_MOBILE.check(estimate.q_mobile)), float(R_O.check(estimate.r_o))
     if np.inf in (estimate.sd_q_mobile, estimate.sd_r_o):
         raise ValueError(
@@ -345,34 +344,34 @@ def _draw_parameters(
         )
     deviation = np.zeros(samples)
     if share > 0.0:
-        # what is cut off below the estimate makes none above it more likely
+        # the lower bound takes no probability to the upper half
         least, most = ndtr([low / share, high / share])
         middle = 0.5 if least < 0.5 else 0.5 * (least + most)
         chance = rng.uniform(-1.0, 1.0, samples)
         deviation = ndtri(middle + chance * np.where(chance < 0.0, middle - least, most - middle))
-    # at a given voltage a larger q_mobile goes with a larger r_o
+    # at the measured voltage a larger q_mobile comes with a larger r_o
     _, by_q, by_r = model.sensitivities(current_A, max(q_C, 1.01 * least_C), r_ohm)
-    known = np.isfinite(by_q) & np.isfinite(by_r)
-    squares = float(by_r[known] @ by_r[known])
-    slope_ohm = -share * q_C * float(by_r[known] @ by_q[known]) / squares if squares > 0.0 else 0.0
+    is_finite = np.isfinite(by_q) & np.isfinite(by_r)
+    squares = float(by_r[is_finite] @ by_r[is_finite])
+    slope_ohm = -share * q_C * float(by_r[is_finite] @ by_q[is_finite]) / squares if squares > 0.0 else 0.0
     slope_ohm = float(np.clip(slope_ohm, -sd_ohm, sd_ohm))
-    own_ohm = float(np.sqrt(sd_ohm**2 - slope_ohm**2))
-    # what r_o has absorbed of the error of the model comes out under another current
+    conditional_ohm = float(np.sqrt(sd_ohm**2 - slope_ohm**2))
+    # the part of the model error that r_o has absorbed appears under another current
     of_model_ohm = mismatch_V / float(np.sqrt(np.mean(current_A**2))) if current_A.any() else 0.0
-    whole_ohm = float(np.hypot(own_ohm, np.sqrt(UNFITTED_ERROR_RATIO**2 - 1.0) * of_model_ohm))
+    total_ohm = float(np.hypot(conditional_ohm, np.sqrt(UNFITTED_ERROR_RATIO**2 - 1.0) * of_model_ohm))
     draws, middle_ohm = rng.standard_normal(samples), r_ohm + slope_ohm * deviation
-    r_o, acting_ohm = (np.clip(middle_ohm + each_ohm * draws, *R_O.limits) for each_ohm in (own_ohm, whole_ohm))
+    r_o, acting_ohm = (np.clip(middle_ohm + each_ohm * draws, *R_O.limits) for each_ohm in (conditional_ohm, total_ohm))
     return q_C * np.exp(share * deviation), r_o, acting_ohm
 
 
 def _resistance_10s_ohm(estimate: Estimate, r_ohm: FloatArray) -> FloatArray:
-    """The resistance after ten seconds of cells with some ``r_o``, which makes up most of it: as far off as that is."""
-    is_known = estimate.sd_r_o > 0.0
-    off_sd = (r_ohm - estimate.r_o) / estimate.sd_r_o if is_known else np.zeros_like(r_ohm)
-    return np.asarray(estimate.resistance_10s_ohm + np.nan_to_num(estimate.sd_resistance_10s_ohm) * off_sd)
+    """Return resistances after ten seconds that deviate from the estimate as ``r_o`` does, in standard deviations."""
+    is_stated = estimate.sd_r_o > 0.0
+    deviation_sd = (r_ohm - estimate.r_o) / estimate.sd_r_o if is_stated else np.zeros_like(r_ohm)
+    return np.asarray(estimate.resistance_10s_ohm + np.nan_to_num(estimate.sd_resistance_10s_ohm) * deviation_sd)
 
 
-def _at_the_end_of(
+def _cells_at_the_end(
     record: Samples,
     model: RecordModel,
     current_A: FloatArray,
@@ -381,8 +380,8 @@ def _at_the_end_of(
     rng: np.random.Generator,
 ) -> tuple[Cells, FloatArray]:
     """
-    Take cells with drawn parameters through a record, and draw their errors from the last voltages measured; with the voltage
-    of the model then, NaN where it was empty before.
+    Simulate cells with drawn parameters along a record, and draw their model errors from the last measured voltages. Return
+    also the last voltage of the model, NaN if the cell was empty before.
     """
     steps, count = len(current_A) - 1, len(parameters[0])
     measured_V = np.interp(record.time_s[0] + model.dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)

@@ -1,4 +1,4 @@
-"""A cell over its discharges: what each lets expect of the next one, and when the capacity will be used up."""
+"""The life of a cell over its discharges: the prior of the next discharge, and the remaining useful life."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
-from battery_env.electrochemistry.tangents import RATE_CONSTANTS
+from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
-from battery_env.estimators.least_squares import Alternative, LeastSquares
+from battery_env.estimators.least_squares import Alternative, LeastSquares, RecordFit
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.records import VARIED_SHARE, DischargeStart, drawn_charge_C, integrate_load, mean_current_A
 from battery_env.records.discharge import Discharge
 
-#: What is believed of a cell before its discharges tell, as shares of q_mobile: the step from one to the next, the error of
-#: one estimate beside the others (both known to a factor of e, one standard deviation), and the sd of the drift.
+#: Priors of a life, as shares of q_mobile: the step from one discharge to the next and the independent error of an estimate
+#: (both to a factor of e, one standard deviation), and the standard deviation of the drift.
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
 _COLUMNS = """
     cycle q_mobile_C sd_q_mobile_C resistance_10s_ohm sd_resistance_10s_ohm settled_resistance_10s measured_resistance_10s_ohm
     r_o_ohm settled findings reason valid capacity_Ah mean_current_A lasted_share
 """.split()
-# Lives that are simulated, and discharges to look ahead.
+# The number of simulated lives, and of discharges ahead.
 _LIVES, _MOST = 2000, 2000
 
 
@@ -65,7 +65,7 @@ class Life:
     :param usual_start: how the discharges start; ``None`` if they do not start and last alike
     :param cut_off_V: cut-off voltage of the discharges, V
     :param alternatives: the model of the last valid discharge, and others that its constants leave open
-        (:meth:`battery_env.LeastSquares.alternatives`)
+        (:class:`~battery_env.estimators.least_squares.Alternative`)
     """
 
     table: pd.DataFrame
@@ -89,29 +89,29 @@ class Life:
         return self._prior_C(1)
 
     def _prior_C(self, count: int, other_A: float | None = None) -> tuple[float, float]:
-        """The prior of so many discharges later, at the load of the life or at another one, A; NaN: at any."""
+        """Return the prior so many discharges later, at the load of the life or at another load, A; NaN: at any load."""
         mean_C, sd_C = self.later_q_mobile_C(count)
         if other_A is not None:
             return mean_C, hypot(sd_C, mean_C * UNFITTED_ERROR_RATIO * hypot(self.sd_share, self._open_share(other_A)))
-        whole = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
-        lasted = float(whole["lasted_share"].iloc[-1]) if len(whole) else 1.0
+        complete = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
+        lasted = float(complete["lasted_share"].iloc[-1]) if len(complete) else 1.0
         return lasted * mean_C, lasted * sd_C
 
     def _open_share(self, load_A: float) -> float:
-        """What the constants leave open of the charge under a load, over that under the load of the life, as a share of it."""
+        """Return the relative uncertainty, by the constants, of the ratio of charges at a load and at that of the life."""
         if not load_A > 0.0 or not self.alternatives:
             return 0.0
         loads = [constant(each_A, "current") for each_A in (load_A, self._usual_A)]
-        given_Ah = np.array(
+        capacity_Ah = np.array(
             [
                 [float(each.model.capacity_Ah([load], self.cut_off_V, each.q_mobile, each.r_o)[0]) for load in loads]
                 for each in self.alternatives
             ]
         )
-        share = given_Ah[:, 0] / given_Ah[:, 1]
-        # both sides of each direction; no more than all of it
-        apart = (share[1:] - share[0]) / np.maximum(share[1:], share[0])
-        return sqrt(0.5 * float(np.nansum(apart**2)))
+        share = capacity_Ah[:, 0] / capacity_Ah[:, 1]
+        # each direction on both sides; at most the whole charge
+        difference = (share[1:] - share[0]) / np.maximum(share[1:], share[0])
+        return sqrt(0.5 * float(np.nansum(difference**2)))
 
     @property
     def _usual_A(self) -> float:
@@ -134,8 +134,8 @@ class Life:
         return self._prior_C(1, nan)
 
     def discharges_until(self, cycle: int | None) -> int:
-        """How many discharges after the last one of the life that of a number is; 1 where the numbers do not tell."""
-        return int(_passed(pd.Series([self.table["cycle"].iloc[-1], cycle]))[-1])
+        """Return how many discharges after the last one of the life a discharge is, by its number; 1 without numbers."""
+        return int(_steps_between(pd.Series([self.table["cycle"].iloc[-1], cycle]))[-1])
 
     def prior_for(self, running: Discharge, load: LoadToCome | None = None) -> tuple[float, float]:
         """
@@ -147,14 +147,14 @@ class Life:
         :param load: to come, as :func:`battery_env.forecast` takes it; ``None``: as so far
         :return: mean and standard deviation of ``q_mobile``, C
         """
-        is_known = load is None or isinstance(load, Real) or (isinstance(load, Load) and load.unit == "current")
-        to_come_A = load.value.tolist() if isinstance(load, Load) else [float(load)] if isinstance(load, Real) else []
+        is_current = load is None or isinstance(load, Real) or (isinstance(load, Load) and load.unit == "current")
+        future_A = load.value.tolist() if isinstance(load, Load) else [float(load)] if isinstance(load, Real) else []
         so_far_A = np.quantile(running.current_A[running.time_s > running.load_on_time_s], [0.05, 0.95])
-        currents_A = np.array([*so_far_A, *(to_come_A if is_known else [])])
+        currents_A = np.array([*so_far_A, *(future_A if is_current else [])])
         ratios = np.maximum(currents_A, 0.0) / self._usual_A
         is_usual = np.ptp([1.0, *ratios]) <= VARIED_SHARE * max(1.0, *ratios)
         farthest = int(np.argmax(np.maximum(ratios, 1.0 / np.maximum(ratios, VARIED_SHARE))))
-        other_A = None if is_known and is_usual else float(currents_A[farthest])
+        other_A = None if is_current and is_usual else float(currents_A[farthest])
         return self._prior_C(self.discharges_until(running.meta.get("cycle")), other_A)
 
     def after(self, count: int) -> Life:
@@ -167,8 +167,8 @@ class Life:
         """
         if not 1 <= check_whole_number("count", count) <= len(self.table):
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
-        kept = ("sd_share", "usual_start", "cut_off_V", "alternatives")
-        return replace(life_of(self.table.iloc[:count]), **{name: getattr(self, name) for name in kept})
+        unchanged = ("sd_share", "usual_start", "cut_off_V", "alternatives")
+        return replace(life_of(self.table.iloc[:count]), **{name: getattr(self, name) for name in unchanged})
 
     def remaining_discharges(self, threshold_Ah: float, probability: ArrayLike = BAND) -> FloatArray:
         """
@@ -193,11 +193,11 @@ class Life:
         drift = drift_mean + drift_sd * truncnorm.rvs(-np.inf, -drift_mean / drift_sd, size=_LIVES, random_state=rng)
         level = level_mean + p_both / p_drift * (drift - drift_mean)
         level += sqrt(max(p_level - p_both**2 / p_drift, 0.0)) * rng.standard_normal(_LIVES)
-        left = np.full(_LIVES, np.inf)
+        remaining = np.full(_LIVES, np.inf)
         for n in range(1, _MOST + 1):
             level = level + drift + self.step_share * rng.standard_normal(_LIVES)
-            left[np.isinf(left) & (level < end)] = n
-        return quantile(left, probability)
+            remaining[np.isinf(remaining) & (level < end)] = n
+        return quantile(remaining, probability)
 
 
 def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: LeastSquares | None = None) -> Life:
@@ -227,39 +227,41 @@ def track_life(discharges: Sequence[Discharge], cut_off_V: float, calibrator: Le
     """
     if calibrator is None:
         return life_before(discharges, Settings(cut_off_V=cut_off_V))
-    held = copy(calibrator)
-    if held.path is None:
-        held.nuisance = {name: sd for name, sd in held.nuisance.items() if name not in RATE_CONSTANTS}
-    return _track(discharges, cut_off_V, held, calibrator)
+    fixed = copy(calibrator)
+    fixed.prior = fixed.prior.with_fixed_rates()
+    return _track(discharges, cut_off_V, fixed, calibrator)
 
 
 def life_before(discharges: Sequence[Discharge], settings: Settings) -> Life:
-    """The life of a cell, by whole discharges that are looked at as the next one is."""
-    known = replace(settings, method="least-squares", initial_soc=1.0)
-    # all discharges have the same constants, whatever these are
-    held = replace(known, cell_rates_sd={}).calibrator()
-    unsure = known.calibrator()
-    assert isinstance(held, LeastSquares)
-    assert isinstance(unsure, LeastSquares)
-    return _track(discharges, settings.resolved.cut_off_V, held, unsure)
+    """Track the life of a cell with the settings of its next discharge."""
+    settings = replace(settings, method="least-squares", initial_soc=1.0)
+    # all discharges have the same constants
+    fixed = replace(settings, cell_rates_sd={}).calibrator()
+    free = settings.calibrator()
+    assert isinstance(fixed, LeastSquares)
+    assert isinstance(free, LeastSquares)
+    return _track(discharges, settings.resolved.cut_off_V, fixed, free)
 
 
-def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares, unsure: LeastSquares) -> Life:
-    """Follow a cell with constants that are held, and tell how sure its last discharge is with constants that are not."""
-    if held.prior_q_mobile_C is not None:
+def _track(discharges: Sequence[Discharge], cut_off_V: float, fixed: LeastSquares, free: LeastSquares) -> Life:
+    """Track a cell with fixed constants, and determine the uncertainty of its last discharge with free constants."""
+    if fixed.prior_q_mobile_C is not None:
         raise ValueError("the calibrator must have no prior of q_mobile: each discharge has to speak for itself")
-    if held.initial_soc != (1.0, 0.0):
+    if fixed.initial_soc != (1.0, 0.0):
         raise ValueError("the calibrator must take discharges to start full: the charge to the cut-off is no capacity else")
     if not len(discharges):
         raise ValueError("discharges must hold at least one discharge")
     usual_start = _usual_start(discharges, cut_off_V)
-    held, unsure = copy(held), copy(unsure)
-    held.usual_start = unsure.usual_start = usual_start or held.usual_start
+    fixed, free = copy(fixed), copy(free)
+    fixed.usual_start = free.usual_start = usual_start or fixed.usual_start
     rows = []
+    last_valid: tuple[Estimate, RecordFit] | None = None
     for position, discharge in enumerate(discharges):
         row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
         try:
-            rows.append(row | _row_of(discharge, cut_off_V, held, unsure))
+            columns, result = _row_of(discharge, cut_off_V, fixed, free)
+            rows.append(row | columns)
+            last_valid = result if columns["valid"] else last_valid
         except ValueError as error:  # of one that cannot be used
             rows.append(
                 row
@@ -272,42 +274,47 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
             )
     texts = [{"reason": reason_of(row["findings"])} for row in rows]
     life = life_of(pd.DataFrame([row | text for row, text in zip(rows, texts, strict=True)], columns=_COLUMNS))
-    last = discharges[int(np.flatnonzero(life.table["valid"])[-1])]
-    record = last.loaded_part(cut_off_V)
-    estimate, alternatives = unsure.estimate(record), unsure.alternatives(record)
+    assert last_valid is not None  # a life without a valid discharge is refused
+    estimate, fit = last_valid
     sd_share = estimate.sd_q_mobile / estimate.q_mobile
-    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=alternatives)
+    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=fit.alternatives())
 
 
 def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> DischargeStart | None:
-    """How the discharges of a life start, if they start and last alike: others do not tell what is full."""
-    parts = []
+    """Return the usual start of the discharges of a life, if they start and last alike; others may not start full."""
+    loaded = []
     for discharge in discharges:
         with suppress(ValueError):  # of one that cannot be used
             if not isnan(discharge.eod_time_s(cut_off_V)):
-                parts.append(discharge.loaded_part(cut_off_V))
-    alike = starting_alike(parts)
+                loaded.append(discharge.loaded_part(cut_off_V))
+    alike = starting_alike(loaded)
     steps = np.abs(np.diff(np.log([drawn_charge_C(part) for part in alike])))
     return usual_start(alike) if len(steps) and np.median(steps) <= VARIED_SHARE else None
 
 
-def _row_of(discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: LeastSquares) -> dict[str, Any]:
-    """What one discharge says alone; of its resistance with constants that are not held, as they age, too."""
+def _row_of(
+    discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: LeastSquares
+) -> tuple[dict[str, Any], tuple[Estimate, RecordFit]]:
+    """
+    Return the row of one discharge in the table, and its estimate and fit with free constants. The resistance in the row is of
+    this estimate, because constants age, too.
+    """
     record = discharge.loaded_part(cut_off_V)
-    estimate = held.estimate(record)
-    of_its_own = estimate if held.nuisance == unsure.nuisance else unsure.estimate(record)
-    end_s = held.model.forecast(record, estimate, cut_off_V).eod_time_s
+    fit = free.fit(record)
+    with_free_constants = free.estimate_of(fit)
+    estimate = with_free_constants if fixed.prior.nuisance == free.prior.nuisance else fixed.estimate(record)
+    end_s = fixed.model.forecast(record, estimate, cut_off_V).eod_time_s
     capacity_Ah = float(integrate_load(record.time_s, record.current_A, end_s)) / 3600.0
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
-    # what leaves the resistance in doubt is no doubt of q_mobile
+    # a finding about the resistance is none about q_mobile
     of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]
-    return {
+    row = {
         "q_mobile_C": estimate.q_mobile,
         "sd_q_mobile_C": estimate.sd_q_mobile,
-        "resistance_10s_ohm": of_its_own.resistance_10s_ohm,
-        "sd_resistance_10s_ohm": of_its_own.sd_resistance_10s_ohm,
+        "resistance_10s_ohm": with_free_constants.resistance_10s_ohm,
+        "sd_resistance_10s_ohm": with_free_constants.sd_resistance_10s_ohm,
         "measured_resistance_10s_ohm": measured_resistance_ohm(record, record.starts_at_rest),
-        "settled_resistance_10s": of_its_own.settled_resistance_10s,
+        "settled_resistance_10s": with_free_constants.settled_resistance_10s,
         "r_o_ohm": estimate.r_o,
         "settled": estimate.settled,
         "findings": estimate.findings,
@@ -316,6 +323,7 @@ def _row_of(discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: 
         "mean_current_A": mean_current_A(record),
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
     }
+    return row, (with_free_constants, fit)
 
 
 def life_of(table: pd.DataFrame) -> Life:
@@ -323,7 +331,7 @@ def life_of(table: pd.DataFrame) -> Life:
     valid = table["valid"].to_numpy(dtype=np.bool_)
     if not valid.any():
         raise ValueError(f"no discharge determines q_mobile. {_most_common(table['findings'])}")
-    readings, passed = np.log(table["q_mobile_C"].to_numpy()), _passed(table["cycle"])
+    readings, steps = np.log(table["q_mobile_C"].to_numpy()), _steps_between(table["cycle"])
     first = int(np.flatnonzero(valid)[0])
     centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
     expected = np.full((len(readings), 2), np.nan)
@@ -331,7 +339,7 @@ def life_of(table: pd.DataFrame) -> Life:
 
     def surprise(logarithms: FloatArray) -> float:
         step, noise = np.exp(np.clip(logarithms, -15.0, 0.0))
-        out = _filtered(readings, passed, valid, first, step, noise, PRIOR_DRIFT_SD_SHARE, expected, state, covariance)
+        out = _filtered(readings, steps, valid, first, step, noise, PRIOR_DRIFT_SD_SHARE, expected, state, covariance)
         return float(out + 0.5 * ((logarithms - centre) ** 2).sum())
 
     best = minimize(surprise, centre, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4}).x
@@ -342,14 +350,14 @@ def life_of(table: pd.DataFrame) -> Life:
     return Life(table, float(step), float(noise), float(state[1]), state, covariance)
 
 
-def _passed(numbers: pd.Series) -> FloatArray:
-    """How many discharges each is after the one before, by their numbers; 1 where these do not increase."""
-    passed = pd.to_numeric(numbers, errors="coerce").diff().to_numpy(dtype=np.float64)
-    return np.where(passed > 1.0, passed, 1.0)
+def _steps_between(numbers: pd.Series) -> FloatArray:
+    """Return how many discharges each one is after the previous one, by their numbers; 1 where numbers do not increase."""
+    steps = pd.to_numeric(numbers, errors="coerce").diff().to_numpy(dtype=np.float64)
+    return np.where(steps > 1.0, steps, 1.0)
 
 
 def _most_common(findings: pd.Series) -> str:
-    """What was found of most discharges, as of the first of them."""
+    """Return the most frequent findings as text, with the values of their first discharge."""
     kinds = [tuple(each.code for each in of_one) for of_one in findings]
     kind, count = Counter(kinds).most_common(1)[0]
     return f"Of {count} of {len(kinds)}: {reason_of(findings.iloc[kinds.index(kind)])}"
@@ -358,7 +366,7 @@ def _most_common(findings: pd.Series) -> str:
 @compiled
 def _filtered(
     readings: FloatArray,
-    passed: FloatArray,
+    steps: FloatArray,
     valid: BoolArray,
     first: int,
     step: float,
@@ -368,15 +376,15 @@ def _filtered(
     state: FloatArray,
     covariance: FloatArray,
 ) -> float:
-    # Kalman's recursions. Returns minus the log likelihood; fills what was expected of each reading (mean and variance of the
-    # level) and the state after the last one
+    # Kalman's recursions. Returns minus the log likelihood; fills the prediction of each reading (mean and variance of the
+    # level) and the state after the last reading
     level, drift = readings[first], 0.0
     p_level, p_both, p_drift = noise**2, 0.0, drift_sd**2
     surprise = 0.0
     for n in range(first + 1, len(readings)):
-        level += passed[n] * drift
-        p_level += 2.0 * passed[n] * p_both + passed[n] ** 2 * p_drift + passed[n] * step**2
-        p_both += passed[n] * p_drift
+        level += steps[n] * drift
+        p_level += 2.0 * steps[n] * p_both + steps[n] ** 2 * p_drift + steps[n] * step**2
+        p_both += steps[n] * p_drift
         expected[n, 0], expected[n, 1] = level, p_level
         if valid[n]:
             variance, innovation = p_level + noise**2, readings[n] - level

@@ -1,4 +1,4 @@
-"""What a discharge says: one table of columns, with their names, units and digits, from which each report follows."""
+"""The results of a discharge: one table of columns, with names, units and digits, from which all reports are made."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from battery_env.records.model import VoltageForecast
 
 #: The methods, for readers of a figure.
 METHOD_NAMES = {"least-squares": "least squares", "policy": "policy"}
-# Columns of the numbers that are judged.
+# The columns of the numbers that a verdict is about.
 _COLUMN_OF = {"q_mobile": "q_mobile_C", "resistance_10s": "resistance_10s_ohm", "r_o": "r_o_ohm"}
 
 
 def quantity(text: str = "", unit: str = "", digits: int = 0, scale: float = 1.0) -> Any:
     """
-    A column: its name for readers, of which a line has the last word, its unit, digits, and the scale to that unit, and what
-    stands for NaN.
+    A column: its name for readers (a line has the last word of it), its unit, its digits, and the scale to that unit.
     """
     return field(metadata={"text": text, "unit": unit, "digits": digits, "scale": scale})
 
@@ -94,36 +93,36 @@ class Calibration:
 
     def row(self) -> dict[str, Any]:
         """Return the columns by name: each finding as a dictionary, and the reason as the last column."""
-        columns = {name: getattr(self, name) for name in _HOW}
+        columns = {name: getattr(self, name) for name in _COLUMNS}
         return columns | {"findings": [asdict(each) for each in self.findings], "reason": self.reason}
 
     def shown(self, name: str, digits: int | None = None, with_unit: bool = True) -> str:
         """Return a column as text for readers."""
-        value, how = getattr(self, name), _HOW[name]
+        value, column = getattr(self, name), _COLUMNS[name]
         if isinstance(value, bool):
             return "yes" if value else "no"
         if np.isnan(value):
             return "not known"
-        digits = how["digits"] if digits is None else digits
-        if how["unit"] in ("Ah", "mohm"):  # of cells of any size, and a standard deviation as its value
-            digits = decimals(how["scale"] * getattr(self, name.removeprefix("sd_")), digits)
-        number = f"{how['scale'] * value:.{digits}f}"
-        return f"{number} {how['unit']}" if how["unit"] and with_unit else number
+        digits = column["digits"] if digits is None else digits
+        if column["unit"] in ("Ah", "mohm"):  # more digits for small cells, as many for a standard deviation as for its value
+            digits = decimals(column["scale"] * getattr(self, name.removeprefix("sd_")), digits)
+        number = f"{column['scale'] * value:.{digits}f}"
+        return f"{number} {column['unit']}" if column["unit"] and with_unit else number
 
     def sd_of(self, name: str) -> str:
         """The standard deviation of a column without its unit, for readers; empty if none is known."""
         sd = f"sd_{name}"
-        return self.shown(sd, with_unit=False) if sd in _HOW and not np.isnan(getattr(self, sd)) else ""
+        return self.shown(sd, with_unit=False) if sd in _COLUMNS and not np.isnan(getattr(self, sd)) else ""
 
     @property
     def settled_alone(self) -> str:
-        """The number that is settled though the other one is not; empty if none is."""
-        known = [name for name in ("settled_q_mobile", f"settled_{self.resistance}") if getattr(self, name)]
-        return "" if self.settled else "".join(_HOW[name]["text"] for name in known)
+        """Return the name of the only settled number; empty if both numbers are settled, or none."""
+        settled = [name for name in ("settled_q_mobile", f"settled_{self.resistance}") if getattr(self, name)]
+        return "" if self.settled else "".join(_COLUMNS[name]["text"] for name in settled)
 
     @property
     def resistance(self) -> str:
-        """Which resistance counts: that after ten seconds, or where there is none that of the model, by its name."""
+        """Which resistance counts, by its name: after ten seconds, or without this one the ohmic resistance of the model."""
         return "r_o" if np.isnan(self.resistance_10s_ohm) else "resistance_10s"
 
     @property
@@ -137,7 +136,7 @@ class Calibration:
         return bool(np.isnan(self.measured_eod_time_s))
 
 
-_HOW = {each.name: each.metadata for each in fields(Calibration) if each.metadata}
+_COLUMNS = {each.name: each.metadata for each in fields(Calibration) if each.metadata}
 # The columns of a line, with their widths and digits.
 _IN_A_LINE = (
     ("q_mobile_C", 8, None),
@@ -149,98 +148,101 @@ _IN_A_LINE = (
 )
 
 
-def text_of(name: str, found: Calibration) -> str:
-    """What a discharge says, for reading."""
+def text_of(name: str, calibration: Calibration) -> str:
+    """Return a calibration as text for readers."""
     lines = [
-        f"{name}: {found.samples} samples from load-on at {found.shown('load_on_time_s')}, {found.shown('drawn_Ah')} drawn"
+        f"{name}: {calibration.samples} samples from load-on at {calibration.shown('load_on_time_s')}, "
+        f"{calibration.shown('drawn_Ah')} drawn"
     ]
-    if found.method != "least-squares":
+    if calibration.method != "least-squares":
         lines.append("calibrated by the policy that comes with the package")
     lines.append("")
-    for column, remark in _rows_of_text(found):
-        line = f"  {_HOW[column]['text'].format(found.settings.resolved):<22}{found.shown(column):>12}"
+    for column, remark in _rows_of_text(calibration):
+        line = f"  {_COLUMNS[column]['text'].format(calibration.settings.resolved):<22}{calibration.shown(column):>12}"
         lines.append(f"{line}   {remark}" if remark else line)
-    if not found.settled:
-        lines += ["", f"Not settled: {found.reason}"]
-        if found.in_progress and not found.settled_q_mobile and found.settings.prior_q_mobile_C is None:
+    if not calibration.settled:
+        lines += ["", f"Not settled: {calibration.reason}"]
+        if calibration.in_progress and not calibration.settled_q_mobile and calibration.settings.prior_q_mobile_C is None:
             lines.append("Or give the earlier discharges of this cell: battery-calibrate forecast FILE --life FOLDER")
     return "\n".join(lines)
 
 
-def _rows_of_text(found: Calibration) -> Iterator[tuple[str, str]]:
-    """The columns that a text has, in their order, each with a remark."""
-    if found.initial_soc < 1.0 or found.sd_initial_soc:
-        yield "initial_soc", f"sd {found.shown('sd_initial_soc')}"
+def _rows_of_text(calibration: Calibration) -> Iterator[tuple[str, str]]:
+    """The columns of a text in their order, each with a remark."""
+    if calibration.initial_soc < 1.0 or calibration.sd_initial_soc:
+        yield "initial_soc", f"sd {calibration.shown('sd_initial_soc')}"
     for name, column in _COLUMN_OF.items():
-        if np.isnan(getattr(found, column)):
+        if np.isnan(getattr(calibration, column)):
             continue
-        sd = f"sd {found.shown(f'sd_{column}')}" if found.sd_of(column) else "no sd stated"
-        value, sd_value, needed = getattr(found, column), getattr(found, f"sd_{column}"), SETTLED_SHARES[name]
-        too_wide = f", {sd_value / value:.0%}: settled below {needed:.0%}" if sd_value > needed * value > 0.0 else ""
-        measured = f", measured {found.shown('measured_resistance_10s_ohm')}" if name == "resistance_10s" else ""
-        of_model = ", of the model with its constants" if name != found.resistance and name == "r_o" else ""
+        sd = f"sd {calibration.shown(f'sd_{column}')}" if calibration.sd_of(column) else "no sd stated"
+        value, sd_value, limit = getattr(calibration, column), getattr(calibration, f"sd_{column}"), SETTLED_SHARES[name]
+        too_wide = f", {sd_value / value:.0%}: settled below {limit:.0%}" if sd_value > limit * value > 0.0 else ""
+        measured = f", measured {calibration.shown('measured_resistance_10s_ohm')}" if name == "resistance_10s" else ""
+        of_model = ", of the model with its constants" if name != calibration.resistance and name == "r_o" else ""
         yield column, f"{sd}{too_wide}{measured}{of_model}"
-    yield "settled", f"only {found.settled_alone} is" if found.settled_alone else ""
-    yield "drawn_Ah", _of_the_charge(found)
-    if not np.isnan(found.nominal_Ah):
-        yield "state_of_health", _of_the_health(found)
+    yield "settled", f"only {calibration.settled_alone} is" if calibration.settled_alone else ""
+    yield "drawn_Ah", _charge_remark(calibration)
+    if not np.isnan(calibration.nominal_Ah):
+        yield "state_of_health", _health_remark(calibration)
     yield "voltage_rmse_V", ""
     yield "predicted_eod_time_s", ""
-    if found.in_progress:
-        yield "remaining_s", _of_the_load(found)
+    if calibration.in_progress:
+        yield "remaining_s", _load_remark(calibration)
     else:
         yield "measured_eod_time_s", ""
 
 
-def _of_the_charge(found: Calibration) -> str:
-    cut_off = f"{found.settings.resolved.cut_off_V:g} V"
-    if found.in_progress:
+def _charge_remark(calibration: Calibration) -> str:
+    cut_off = f"{calibration.settings.resolved.cut_off_V:g} V"
+    if calibration.in_progress:
         return "so far"
-    if np.isnan(found.predicted_capacity_Ah):
+    if np.isnan(calibration.predicted_capacity_Ah):
         return f"to {cut_off}; not the capacity, as not all of the charge is known"
-    if found.initial_soc < 1.0:
-        return f"to {cut_off}; from full it would have been {found.shown('predicted_capacity_Ah')}"
+    if calibration.initial_soc < 1.0:
+        return f"to {cut_off}; from full it would have been {calibration.shown('predicted_capacity_Ah')}"
     return f"the capacity to {cut_off}"
 
 
-def _of_the_health(found: Calibration) -> str:
-    if np.isnan(found.state_of_health):
+def _health_remark(calibration: Calibration) -> str:
+    if np.isnan(calibration.state_of_health):
         return "as the capacity is not"
-    how = "predicted" if found.in_progress or found.initial_soc < 1.0 else "drawn"
-    of = "" if found.settings.nominal_Ah is not None else ", what the given cell yields at this load"
-    sd = f"sd {found.shown('sd_predicted_capacity_Ah')}"
-    return f"{found.shown('predicted_capacity_Ah')} ({sd}), {how}, of {found.nominal_Ah:.4g} Ah{of}"
+    how = "predicted" if calibration.in_progress or calibration.initial_soc < 1.0 else "drawn"
+    of = "" if calibration.settings.nominal_Ah is not None else ", what the given cell yields at this load"
+    sd = f"sd {calibration.shown('sd_predicted_capacity_Ah')}"
+    return f"{calibration.shown('predicted_capacity_Ah')} ({sd}), {how}, of {calibration.nominal_Ah:.4g} Ah{of}"
 
 
-def _of_the_load(found: Calibration) -> str:
-    sd = f"sd {found.shown('sd_predicted_eod_time_s')}, " if found.sd_of("predicted_eod_time_s") else ""
-    goes_on = "on average, as so far, an assumption: the load varied" if found.load_varied else "to go on"
-    return f"{sd}{found.future_current_A:.3g} A {goes_on}"
+def _load_remark(calibration: Calibration) -> str:
+    sd = f"sd {calibration.shown('sd_predicted_eod_time_s')}, " if calibration.sd_of("predicted_eod_time_s") else ""
+    goes_on = "on average, as so far, an assumption: the load varied" if calibration.load_varied else "to go on"
+    return f"{sd}{calibration.future_current_A:.3g} A {goes_on}"
 
 
-def _numbers(found: Calibration) -> list[str]:
+def _numbers(calibration: Calibration) -> list[str]:
     """The columns of a line."""
-    parts = []
+    texts = []
     for column, width, digits in _IN_A_LINE:
-        is_second = column == "r_o_ohm" and found.resistance != "r_o"
-        if not (np.isnan(getattr(found, column)) or is_second):
-            sd, label = found.sd_of(column), _HOW[column]["text"].split()[-1]
-            parts.append(f"{label} {found.shown(column, digits):>{width}}" + (f" sd {sd:>3}" if sd else ""))
-    return parts
+        is_second = column == "r_o_ohm" and calibration.resistance != "r_o"
+        if not (np.isnan(getattr(calibration, column)) or is_second):
+            sd, label = calibration.sd_of(column), _COLUMNS[column]["text"].split()[-1]
+            texts.append(f"{label} {calibration.shown(column, digits):>{width}}" + (f" sd {sd:>3}" if sd else ""))
+    return texts
 
 
-def line_of(name: str, found: Calibration) -> str:
-    """The same in one line."""
-    return f"{name:<18} " + "  ".join([*_numbers(found), f"{found.state}: {found.reason}" if found.findings else found.state])
+def line_of(name: str, calibration: Calibration) -> str:
+    """Return a calibration in one line."""
+    return f"{name:<18} " + "  ".join(
+        [*_numbers(calibration), f"{calibration.state}: {calibration.reason}" if calibration.findings else calibration.state]
+    )
 
 
 def change_of(first: Calibration, last: Calibration) -> str:
-    """How the numbers of a cell went from one discharge to another."""
-    columns = ("q_mobile_C", f"{last.resistance}_ohm")
-    return ", ".join(f"{_HOW[each]['text']} {first.shown(each, with_unit=False)} -> {last.shown(each)}" for each in columns)
+    """Return the change of a cell between two discharges."""
+    names = ("q_mobile_C", f"{last.resistance}_ohm")
+    return ", ".join(f"{_COLUMNS[each]['text']} {first.shown(each, with_unit=False)} -> {last.shown(each)}" for each in names)
 
 
-def title_of(name: str, found: Calibration) -> str:
-    """The same above a figure."""
-    numbers = ", ".join(" ".join(each.split()) for each in _numbers(found))
-    return f"{name}: {found.state}\n{numbers}"
+def title_of(name: str, calibration: Calibration) -> str:
+    """Return the title of a figure."""
+    numbers = ", ".join(" ".join(each.split()) for each in _numbers(calibration))
+    return f"{name}: {calibration.state}\n{numbers}"

@@ -1,4 +1,4 @@
-"""The end of a discharge in progress, from the life of its cell and the load to come."""
+"""The end of a discharge in progress, from the earlier life of its cell and the load to come."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from battery_env.lab.sources import Source, find_sources, read_source, record_na
 from battery_env.loads import Load, LoadToCome
 from battery_env.records.discharge import Discharge
 
-# By name of the column of a profile: the unit of the load.
+# The unit of a load, by the column of its file.
 _LOAD_COLUMNS: dict[str, LoadUnit] = {"current_A": "current", "power_W": "power"}
 
 
 @dataclass(frozen=True)
 class End:
     """
-    When a discharge in progress will end, and what that rests on.
+    The end of a discharge in progress, with its calibration.
 
-    :param name: what the discharge is called in results
-    :param calibration: what the record says, and what may come
-    :param life: of the cell before; ``None``: not known
+    :param name: name of the discharge in results
+    :param calibration: calibration of the record, with its forecast
+    :param life: earlier life of the cell; ``None``: unknown
     """
 
     name: str
@@ -44,7 +44,7 @@ class End:
 
     @property
     def forecast(self) -> Forecast:
-        """What may come."""
+        """The forecast of the end."""
         assert self.calibration.end is not None
         return self.calibration.end
 
@@ -55,21 +55,21 @@ class End:
 
     @property
     def contradicted(self) -> bool:
-        """Whether something in the record contradicts the estimate; one that is only imprecise has a wide interval."""
+        """Whether the record contradicts the estimate; an estimate that is only imprecise has a wide interval."""
         return not self.calibration.settled and not is_only_imprecise(self.calibration.findings)
 
     def row(self) -> dict[str, Any]:
-        """All of it by name, with units; of what is uncertain the quantiles ``probability``."""
-        found, prior_C = self.forecast, self.calibration.settings.prior_q_mobile_C
+        """Return all numbers by name, with units; of uncertain numbers the quantiles ``probability``."""
+        forecast, prior_C = self.forecast, self.calibration.settings.prior_q_mobile_C
         samples = {
-            "eod_time_s": found.eod_time_s,
-            "remaining_s": found.remaining_s,
-            "soc": found.soc,
-            "q_mobile_C": found.q_mobile,
-            "resistance_10s_ohm": found.resistance_10s_ohm,
-            "r_o_ohm": found.r_o,
-            "capacity_Ah": found.capacity_Ah,
-            "state_of_health": found.state_of_health,
+            "eod_time_s": forecast.eod_time_s,
+            "remaining_s": forecast.remaining_s,
+            "soc": forecast.soc,
+            "q_mobile_C": forecast.q_mobile,
+            "resistance_10s_ohm": forecast.resistance_10s_ohm,
+            "r_o_ohm": forecast.r_o,
+            "capacity_Ah": forecast.capacity_Ah,
+            "state_of_health": forecast.state_of_health,
         }
         return {
             "record": self.name,
@@ -77,20 +77,20 @@ class End:
             "settled": self.calibration.settled,
             "findings": [asdict(each) for each in self.calibration.findings],
             "reason": self.calibration.reason,
-            "load": found.load_name,
-            "cut_off_V": found.cut_off_V,
-            "now_s": found.now_s,
+            "load": forecast.load_name,
+            "cut_off_V": forecast.cut_off_V,
+            "now_s": forecast.now_s,
             "probability": list(BAND),
             **{name: [finite_or_none(value) for value in quantile(values, BAND).tolist()] for name, values in samples.items()},
-            "nominal_Ah": finite_or_none(found.nominal_Ah),
+            "nominal_Ah": finite_or_none(forecast.nominal_Ah),
             "life_discharges": 0 if self.life is None else int(self.life.table["valid"].sum()),
             "discharges_after_life": self.discharges_after_life,
             "prior_q_mobile_C": None if prior_C is None else list(prior_C),
-            "notes": list(found.notes),
+            "notes": list(forecast.notes),
         }
 
     def text(self) -> str:
-        """The same for reading."""
+        """Return the forecast as text for readers."""
         lines = [self.name]
         if self.life is not None:
             valid = self.life.table["valid"]
@@ -106,13 +106,13 @@ class End:
         return "\n".join([*lines, self.forecast.summary()])
 
     def draw(self, path: Path) -> None:
-        """Write a new figure."""
+        """Write the forecast as a new figure."""
         from battery_env.plotting import literal  # here, as matplotlib takes long to import
 
         figure = self.forecast.plot()
         figure.suptitle(f"{literal(self.name)}, then {self.forecast.load_name}", fontsize=10)
-        with replacing(path, new=True) as part:
-            figure.savefig(part, dpi="figure")
+        with replacing(path, new=True) as file:
+            figure.savefig(file, dpi="figure")
 
 
 def forecast_end(
@@ -123,21 +123,21 @@ def forecast_end(
     life: Life | None = None,
 ) -> Forecast:
     """
-    The end of a discharge in progress, with all that :class:`~battery_env.Settings` and the life of its cell know of it.
+    Forecast the end of a discharge in progress, from :class:`~battery_env.Settings` and the earlier life of its cell.
 
     .. code-block:: python
 
       life = track_life(read_discharges("life.csv"), cut_off_V=2.7)
-      found = forecast_end(read_discharges("running.csv")[0], load=1.5, life=life)
-      print(found.eod_quantile_s([0.05, 0.5, 0.95]), found.summary())
+      end = forecast_end(read_discharges("running.csv")[0], load=1.5, life=life)
+      print(end.eod_quantile_s([0.05, 0.5, 0.95]), end.summary())
 
-    :param discharge: what was recorded until now
-    :param settings: how to look at it; ``None``: the defaults
-    :param load: from the last sample under load on, as :func:`battery_env.forecast` takes it; ``None``: as so far
-    :param samples: of what may come
-    :param life: of the cell before, whose prior is taken that suits the load; ``None``: that of the settings, if any.
-        Constants are held along with a life, or with a prior and a load: they and ``r_o`` carry over together
-    :raises ValueError: if the discharge cannot be used, or a load cannot be meant
+    :param discharge: the record so far
+    :param settings: how to calibrate the record; ``None``: the defaults
+    :param load: load from the last sample under load on, as for :func:`battery_env.forecast`; ``None``: as so far
+    :param samples: number of samples of the forecast
+    :param life: earlier life of the cell, which gives the prior for this load; ``None``: the prior of the settings, if any.
+        With a life, or with a prior and a load, the constants are fixed: they and ``r_o`` carry over together
+    :raises ValueError: if the discharge cannot be used, or the load is out of range
     """
     end = calibrate_running(discharge, Settings() if settings is None else settings, load, samples, life).end
     assert end is not None
@@ -147,8 +147,14 @@ def forecast_end(
 def calibrate_running(
     discharge: Discharge, settings: Settings, load: LoadToCome | None = None, samples: int = 1000, life: Life | None = None
 ) -> Calibration:
-    """What a discharge in progress says, with the life of its cell before, and the end that :func:`forecast_end` tells."""
-    return calibrated(discharge, _known_before(discharge, settings, load, life), load, samples, end_is_asked=True)
+    """Calibrate a discharge in progress, with the prior and the usual start of its earlier life, and forecast its end."""
+    if life is not None:
+        start = life.usual_start or settings.usual_start
+        settings = replace(settings, prior_q_mobile_C=life.prior_for(discharge, load), usual_start=start)
+    # constants without a stated uncertainty carry over from a life, or to another load
+    carries_over = settings.prior_q_mobile_C is not None and (life is not None or load is not None)
+    fixes_constants = carries_over and not settings.cell_rates_sd
+    return calibrated(discharge, settings, load, samples, end_is_asked=True, fixes_constants=fixes_constants)
 
 
 def read_load(path: str | Path) -> Load:
@@ -161,37 +167,37 @@ def read_load(path: str | Path) -> Load:
         table = pd.read_csv(path, sep=None, engine="python", encoding="utf-8-sig", compression=None)
     except OSError:
         raise
-    except Exception as error:  # pandas raises whatever a file leads it to
+    except Exception as error:  # pandas raises any kind of error
         raise ValueError(f"{path}: no table: {error}") from error
     table.columns = table.columns.str.strip()
-    found = [name for name in _LOAD_COLUMNS if name in table.columns]
-    if "time_s" not in table.columns or len(found) != 1:
+    columns = [name for name in _LOAD_COLUMNS if name in table.columns]
+    if "time_s" not in table.columns or len(columns) != 1:
         names = ", ".join(table.columns)
         raise ValueError(f"{path}: a load has the columns time_s and either current_A or power_W, got {names}")
     try:
-        load = Load(table["time_s"].to_numpy(), table[found[0]].to_numpy(), _LOAD_COLUMNS[found[0]])
+        load = Load(table["time_s"].to_numpy(), table[columns[0]].to_numpy(), _LOAD_COLUMNS[columns[0]])
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
     if load.value.max() <= 0.0:
-        raise ValueError(f"{path}: {found[0]} is nowhere above 0, so that nothing is drawn: a discharge is positive")
+        raise ValueError(f"{path}: {columns[0]} is nowhere above 0, so that nothing is drawn: a discharge is positive")
     return load
 
 
 def figure_of(argument: str, folder: Path) -> Path:
-    """Where the end of a record is drawn, which is named as on the command line."""
+    """The file of the figure, for a record as the command line names it."""
     source = find_sources([argument])[0]
     return folder / f"{record_name(source.stem, source.cycle)}_forecast.png"
 
 
 def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
     """
-    Read the discharges of a cell before the one in progress, in the order in which they began where each tells, and else in
-    that of the names; where the one in progress is among them, those before it. All that is named counts as of one cell: of
-    several folders with a warning. What cannot be read is left out with a warning.
+    Read the discharges of a cell before the one in progress: by their dates if all have dates, otherwise by their names. If
+    the arguments include the discharge in progress, only the discharges before it count. All records are taken for one
+    cell's, with a warning if they are in several folders. An unreadable record is left out with a warning.
     """
     before: list[Discharge] = []
     after: list[Discharge] = []
-    named, began = before, ""
+    group, running_start = before, ""
     sources = find_sources(arguments)
     folders = sorted({str(Path(source.path).parent) for source in sources})
     if len(folders) > 1:
@@ -200,67 +206,55 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
         is_its_file = Path(source.path).resolve() == Path(running.path).resolve()
         try:
             recordings = read_source(source, file_format)
-        except Exception as error:  # readers of files raise what they like
+        except Exception as error:  # readers of files raise any kind of error
             warnings.warn(f"{source.argument} is left out: {' '.join(str(error).split())}", stacklevel=2)
             continue
         for recording in recordings:
             number = recording.meta.get("cycle", "")
             if is_its_file and running.cycle in (None, number):
-                named, began = after, recording.meta.get("start_time", "")
+                group, running_start = after, recording.meta.get("start_time", "")
                 continue
             try:
-                named.append(recording.discharge())
+                group.append(recording.discharge())
             except (TypeError, ValueError) as error:
                 warnings.warn(f"{source.path}:{number} is left out: {error}", stacklevel=2)
-    everything = [*before, *after]
-    are_dated = all(each.meta.get("start_time") for each in everything)
+    discharges = [*before, *after]
+    are_dated = all(each.meta.get("start_time") for each in discharges)
     if len(sources) > 1 and not are_dated:
-        order = ", ".join(dict.fromkeys(str(each.meta.get("source")) for each in everything))
+        order = ", ".join(dict.fromkeys(str(each.meta.get("source")) for each in discharges))
         warnings.warn(f"--life: in the order of names, as not all records have dates: {order}", stacklevel=2)
-    if are_dated and (began or named is before):
-        everything.sort(key=lambda each: each.meta["start_time"])
-        before = [each for each in everything if not began or each.meta["start_time"] < began]
+    if are_dated and (running_start or group is before):
+        discharges.sort(key=lambda each: each.meta["start_time"])
+        before = [each for each in discharges if not running_start or each.meta["start_time"] < running_start]
     if not before:
         raise ValueError(f"{', '.join(arguments)}: no discharge before {running.argument}")
     return before
-
-
-def _known_before(running: Discharge, settings: Settings, load: LoadToCome | None, life: Life | None) -> Settings:
-    """
-    With the prior and the start of a life. Constants of unstated doubt are held where they carry over: from a life, to another
-    load.
-    """
-    if life is not None:
-        start = life.usual_start or settings.usual_start
-        settings = replace(settings, prior_q_mobile_C=life.prior_for(running, load), usual_start=start)
-    is_held = settings.prior_q_mobile_C is not None and (life is not None or load is not None)
-    return replace(settings, cell_rates_sd=settings.cell_rates_sd or {}) if is_held else settings
 
 
 def end_of_record(
     argument: str, settings: Settings, file_format: FileFormat, life: Sequence[str] = (), load: Path | None = None
 ) -> End:
     """
-    The end of a discharge in a file, as the command line names it (of several the last one), the discharges before it (none:
-    their life is not known) and the load to come (``None``: as so far).
+    Forecast the end of a discharge in a file, by the arguments of the command line: the file (of several discharges the last
+    one), the earlier discharges (none: the life is unknown) and the file of the load to come (``None``: as so far).
     """
-    to_come = None if load is None else read_load(load)
+    future_load = None if load is None else read_load(load)
     sources = find_sources([argument])
     if len(sources) > 1:
         raise ValueError(f"{argument} holds {len(sources)} files: name the one in progress, and the others with --life")
     recording = read_source(sources[0], file_format)[-1]
     source, running = sources[0]._replace(cycle=recording.meta.get("cycle")), recording.discharge()
-    past = None
+    earlier_life = None
     if life:
-        before = read_life(life, source, file_format)
-        named = sorted({each.meta["cell"] for each in [*before, running] if "cell" in each.meta})
-        if len(named) > 1:
-            raise ValueError(f"--life: these are discharges of {' and '.join(named)}: give those of the cell in progress")
-        past = life_before(before, settings)
-    found = calibrate_running(running, settings, to_come, life=past)
-    if not found.in_progress:
+        earlier = read_life(life, source, file_format)
+        cells = sorted({each.meta["cell"] for each in [*earlier, running] if "cell" in each.meta})
+        if len(cells) > 1:
+            raise ValueError(f"--life: these are discharges of {' and '.join(cells)}: give those of the cell in progress")
+        earlier_life = life_before(earlier, settings)
+    calibration = calibrate_running(running, settings, future_load, life=earlier_life)
+    if not calibration.in_progress:
         raise ValueError(
-            f"{argument} reaches {settings.resolved.cut_off_V:g} V at {found.measured_eod_time_s:.0f} s, so that nothing is "
-            "left to forecast: calibrate it, or give a lower --cut-off"
+            f"{argument} reaches {settings.resolved.cut_off_V:g} V at {calibration.measured_eod_time_s:.0f} s, so that "
+            "nothing is left to forecast: calibrate it, or give a lower --cut-off"
         )
-    return End(record_name(source.stem, source.cycle), found, past)
+    return End(record_name(source.stem, source.cycle), calibration, earlier_life)

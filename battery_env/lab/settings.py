@@ -1,10 +1,11 @@
-"""How a discharge of a real cell is looked at: settings that check themselves, and the calibrator that they ask for."""
+"""Settings for the calibration of real cells, which check themselves and build their calibrator."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from math import exp, hypot, log
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
@@ -15,10 +16,13 @@ from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.cell import Q_MOBILE_PER_CAPACITY, new_cell_of
 from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
+from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.search import SIZE_WIDTH
+from battery_env.estimators.verdict import PRIOR_LIMIT_SD
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.records import CUT_OFF_V, DischargeStart
@@ -27,7 +31,7 @@ from battery_env.records.samples import check_cut_off
 Method = Literal["least-squares", "policy"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
-# What cells of some size hold, new or worn, as a share of a new one: about this much.
+# Usual charge of a cell, new or aged, as a share of a new cell of its size.
 _USUAL_SHARE = 0.75
 # Constants that were fitted at one load moved q_mobile by 5 % at twice that load, and so by less than the 2 % of a settled
 # estimate within this ratio.
@@ -75,7 +79,8 @@ class Settings:
     :param thermal: whether the temperature of the model changes; ``None``: as in the fit of ``cell``, or true
     :param nominal_Ah: nominal capacity for the state of health, Ah; ``None``: the charge that ``cell`` with its own
         ``q_mobile`` and ``r_o`` gives from full at the current of the discharge, or unknown without a ``cell``. Without other
-        prior knowledge the nominal capacity is also the expected size of a cell in progress, instead of a new 18650
+        prior knowledge the nominal capacity is also the expected size of a cell in progress, instead of a new 18650. No
+        estimate of another size than such cells have, new or worn, is settled
     :param cell: constants of the model, or a result of ``fit_cell``: more than a quarter beyond the loads of the fit no
         estimate is settled, and the nominal capacity is unknown. Or a result of ``fit_life``, the path of aging cells of this
         kind, for least squares. ``None``: the constants of a new 18650
@@ -114,7 +119,7 @@ class Settings:
         check_cut_off(self.resolved.cut_off_V)
 
     def _refuse_for_the_policy(self) -> None:
-        """Refuse what a policy cannot be told: it has learned on one model, a new 18650."""
+        """Refuse settings that a policy cannot use: it has learned on one model, a new 18650."""
         defaults = {field.name: field.default for field in fields(self)} | {"mismatch_V": UNFITTED_MISMATCH_V}
         stated = vars(self) | self.resolved._asdict()
         for name in ("cell", "prior_q_mobile_C", "mismatch_V", "current_gain_sd", "initial_soc"):
@@ -125,23 +130,23 @@ class Settings:
 
     @property
     def resolved(self) -> ResolvedSettings:
-        """Cut-off, error to expect, kind of the model and usual start: as stated, or else as the cell tells."""
-        told = ResolvedSettings(CUT_OFF_V, UNFITTED_MISMATCH_V, thermal=True, usual_start=None)
+        """Cut-off, expected model error, kind of the model and usual start: as stated, or else of the cell."""
+        resolved = ResolvedSettings(CUT_OFF_V, UNFITTED_MISMATCH_V, thermal=True, usual_start=None)
         if isinstance(self.cell, CellFit):
-            told = ResolvedSettings(self.cell.cell.VEOD, self.cell.mismatch_V, self.cell.thermal, self.cell.usual_start)
+            resolved = ResolvedSettings(self.cell.cell.VEOD, self.cell.mismatch_V, self.cell.thermal, self.cell.usual_start)
         elif isinstance(self.cell, AgingPath):
-            told = ResolvedSettings(self.cell.cell.VEOD, self.cell.mismatch_V, thermal=False, usual_start=None)
-        stated = {name: value for name in told._fields if (value := getattr(self, name)) is not None}
-        return told._replace(**stated)
+            resolved = ResolvedSettings(self.cell.cell.VEOD, self.cell.mismatch_V, thermal=False, usual_start=None)
+        stated = {name: value for name in resolved._fields if (value := getattr(self, name)) is not None}
+        return resolved._replace(**stated)
 
-    def but(self, **others: Any) -> Settings:
-        """The same with other settings; what nobody stated of another cell is what that one tells."""
-        return replace(self, **others)
+    def but(self, **changes: Any) -> Settings:
+        """Return settings with some changes; options that nobody stated follow a changed cell."""
+        return replace(self, **changes)
 
     def expecting(self, current_A: float) -> Settings:
         """
-        With the error to expect at the age that a prior tells, under a mean current that constants were fitted to, where no
-        error is stated.
+        Return settings with the expected model error at the age of the prior, if no error is stated and the constants were
+        fitted to this mean current.
         """
         if self.fit is None or self.mismatch_V is not None or self.prior_q_mobile_C is None or self.other_load(current_A):
             return self
@@ -149,34 +154,34 @@ class Settings:
 
     @property
     def constants(self) -> CellParameters:
-        """Of the model."""
+        """Constants of the model."""
         return self.cell.cell if isinstance(self.cell, CellFit | AgingPath) else self.cell or NEW_CELL
 
     @property
     def fit(self) -> CellFit | None:
-        """What discharges of the cell say about its constants, if that is known."""
+        """The fit of the constants to discharges of the cell; ``None`` without a fit."""
         return self.cell if isinstance(self.cell, CellFit) else None
 
     @property
     def path(self) -> AgingPath | None:
-        """How cells of its kind age, if that is known."""
+        """The path of aging cells of this kind; ``None`` without a path."""
         return self.cell if isinstance(self.cell, AgingPath) else None
 
     @property
     def q_mobile_bounds_C(self) -> tuple[float, float]:
-        """Where to search for ``q_mobile``, C."""
+        """Bounds of the search for ``q_mobile``, C."""
         return self.fit.q_mobile_bounds_C if self.fit else Q_MOBILE.limits
 
     @classmethod
-    def for_file(cls, path: Path | None, **others: Any) -> Settings:
+    def for_file(cls, path: Path | None, **stated: Any) -> Settings:
         """
-        Settings that use what a file says of a cell, if there is one; a fit that is in doubt is warned of.
+        Return settings with the cell of a file, if there is one; a doubtful fit is a warning.
 
         :param path: what the command fit, ``CellParameters.to_json`` or ``AgingPath.to_json`` wrote
-        :param others: further settings, which replace what the file tells
+        :param stated: further settings, which take precedence over the file
         """
         if path is None:
-            return cls(**others)
+            return cls(**stated)
         if not path.is_file():
             raise FileNotFoundError(
                 f"no file {str(path)!r} for --cell: give what the command fit, CellParameters.to_json or AgingPath.to_json "
@@ -185,30 +190,45 @@ class Settings:
         cell = read_cell(path)
         if isinstance(cell, CellFit) and cell.doubt:
             warnings.warn(f"{path}: {cell.doubt}", stacklevel=2)
-        return cls(cell=cell, **others)
+        return cls(cell=cell, **stated)
 
     @property
     def _new_q_mobile_C(self) -> float:
-        """Of a new cell of the nominal capacity, or of a new 18650 where none is stated."""
+        """``q_mobile`` of a new cell of the nominal capacity; of a new 18650 if no capacity is stated."""
         if self.nominal_Ah is None:
             return NEW_CELL.q_mobile
         return float(np.clip(Q_MOBILE_PER_CAPACITY * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
 
     @property
     def usual_q_mobile_C(self) -> float | None:
-        """About what a cell of its size holds, new or worn, of which nothing else is known; ``None``: more is known."""
+        """Usual ``q_mobile`` of cells of this size, new or aged; ``None`` with a prior or a cell, which determine more."""
         is_known = self.prior_q_mobile_C is not None or self.cell is not None
         return None if is_known else _USUAL_SHARE * self._new_q_mobile_C
 
-    def with_nominal_cell(self) -> Settings:
-        """With the constants of a cell of the nominal capacity, where that is of another size and nothing else is known."""
-        cell = new_cell_of(self._new_q_mobile_C)
-        if self.usual_q_mobile_C is None or self.method == "policy" or cell is NEW_CELL:
-            return self
-        return replace(self, cell=cell, cell_rates_sd=RATE_PRIOR_SD)
+    @property
+    def constants_in_progress(self) -> CellParameters:
+        """Constants for a discharge in progress: of a cell of the nominal capacity, without a prior or a cell."""
+        if self.usual_q_mobile_C is None or self.method == "policy":
+            return self.constants
+        return new_cell_of(self._new_q_mobile_C)
+
+    def other_size(self, estimate: Estimate, drawn_C: float) -> tuple[Finding, ...]:
+        """
+        Why an estimate is not of a cell of the nominal capacity, new or worn; empty if it may be, or none is stated. The cell
+        holds no less than was drawn, and no more than ``q_mobile``, and of that what is nearest is compared.
+        """
+        if self.nominal_Ah is None:
+            return ()
+        usual_C = _USUAL_SHARE * self._new_q_mobile_C
+        nearest_C = float(np.clip(usual_C, Q_MOBILE_PER_CAPACITY * drawn_C, estimate.q_mobile))
+        ratio = exp(PRIOR_LIMIT_SD * hypot(SIZE_WIDTH, estimate.sd_q_mobile / estimate.q_mobile))
+        if not abs(log(nearest_C / usual_C)) > log(ratio):
+            return ()
+        sizes_C = {"record_Ah": nearest_C, "least_Ah": usual_C / ratio, "most_Ah": usual_C * ratio}
+        return (Finding.of(Reason.PRIOR_WRONG, "q_mobile", **{name: each_C / 3600.0 for name, each_C in sizes_C.items()}),)
 
     def other_load(self, current_A: float) -> tuple[Finding, ...]:
-        """Why the constants may not hold for a mean current; empty if they do."""
+        """Return why the constants may be wrong at a mean current; empty if they were fitted to such a current."""
         if self.fit is None or self.fit.currents_A is None or not current_A > 0.0:
             return ()
         low_A, high_A = self.fit.currents_A
@@ -217,7 +237,7 @@ class Settings:
         return (Finding.of(Reason.OTHER_LOAD, load_A=current_A, least_fitted_A=low_A, most_fitted_A=high_A),)
 
     def tells_new_capacity(self, current_A: float) -> bool:
-        """Whether the constants tell what a new cell yields under a load: where they were fitted to this load alone."""
+        """Return whether the constants determine the capacity of a new cell at a load: if fitted to this load alone."""
         low_A, high_A = (self.fit and self.fit.currents_A) or (current_A, current_A)
         return self.cell is not None and high_A <= low_A * _SAME_LOAD and not self.other_load(current_A)
 
@@ -225,29 +245,29 @@ class Settings:
         self, cell: CellParameters | None = None, start: Start | None = None, usual_q_mobile_C: float | None = None
     ) -> LeastSquares | PolicyEstimator:
         """
-        The calibrator that is asked for. It refuses options that it cannot use.
+        Build the calibrator, which refuses options that it cannot use.
 
         :param cell: constants of the model at the temperature of a discharge; ``None``: those of the settings
         :param start: how the discharge starts; ``None``: as the settings say
-        :param usual_q_mobile_C: about what cells of its size hold, as :attr:`usual_q_mobile_C` says, for least squares of a
-            record in progress; ``None``: any size is as likely
+        :param usual_q_mobile_C: usual ``q_mobile`` of cells of this size, for least squares of a record in progress;
+            ``None``: all sizes are equally likely
         :raises ValueError: for an option out of range
         """
         if self.method == "policy":
             return PolicyEstimator.pretrained(recorded=True)
         resolved = self.resolved
-        stated: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
+        initial_soc: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
         common: dict[str, Any] = {
             "cell": cell or self.constants,
             "thermal": resolved.thermal,
             "prior_q_mobile_C": self.prior_q_mobile_C,
             "current_gain_sd": self.current_gain_sd,
-            "initial_soc": stated if start is None else (start.soc, start.sd_soc),
+            "initial_soc": initial_soc if start is None else (start.soc, start.sd_soc),
             "q_mobile_bounds_C": self.q_mobile_bounds_C,
             "usual_start": resolved.usual_start,
         }
         rates_sd = self._rates_sd()
-        # constants that are anybody's, once they are free, explain as much of the error as q_mobile and r_o absorb
+        # free constants of any kind of cell explain as much of the model error as q_mobile and r_o absorb
         is_explained = rates_sd is RATE_PRIOR_SD
         mismatch_V = resolved.mismatch_V / UNFITTED_ERROR_RATIO if is_explained else resolved.mismatch_V
         return LeastSquares(
@@ -256,8 +276,8 @@ class Settings:
 
     def _rates_sd(self) -> Mapping[str, float]:
         """
-        How well the rate constants are known, that are searched for beside both parameters: all that least squares are not
-        told. A path tells them.
+        Uncertainty of the rate constants that least squares estimate with both parameters: of all constants that no setting
+        determines. A path determines them.
         """
         if self.path is not None:
             return {}

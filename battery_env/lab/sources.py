@@ -16,16 +16,16 @@ from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
 from battery_env.records.recording import Recording
 from battery_env.records.refusals import Origin
 
-#: Results that an earlier command wrote among the records: rows, the table of them, voltages, a figure.
+#: Names of results: rows, their table, voltages, a figure.
 RUN, TABLE, VOLTAGE, LIFE = "estimate.jsonl", "estimate.csv", "_voltage", "life.png"
-# How those begin that a record may be called as.
+# First bytes of results whose names a record may have.
 _RESULT_HEADS = (b"record,source,cell,cycle,", b"time_s,voltage_V,current_A,model_V\n")
 _NASA_SUFFIX = ".mat"
-# What NASA's discharges have beside them, in the layout of the bundled ones, is a table of tests and no record.
+# The table of tests of NASA's discharges, in the layout of the bundled ones, is no record.
 _NO_RECORDS = ("cycles.csv",)
-# So many files are named where many are meant.
+# Messages name at most so many files.
 _MOST_NAMED = 10
-# How what workbooks take for a formula begins.
+# First characters of a formula in workbooks.
 _FORMULA_HEADS = ("=", "+", "-", "@")
 
 
@@ -35,9 +35,9 @@ class Source(NamedTuple):
 
     :param path: a file, or the name of a bundled cell
     :param cycle: which discharge; ``None``: all of them
-    :param stem: what names of results start with
-    :param cell: which cell it is of
-    :param given: the argument that names it, as the folder that it was found in
+    :param stem: start of the names of results
+    :param cell: name of the cell
+    :param given: the argument of the command line, such as the folder of a file
     """
 
     path: str
@@ -48,19 +48,19 @@ class Source(NamedTuple):
 
     @property
     def argument(self) -> str:
-        """As on the command line."""
+        """The source as an argument of the command line."""
         return self.path if self.cycle is None else f"{self.path}:{self.cycle}"
 
     @property
     def key(self) -> str:
-        """The same wherever the command is called."""
+        """An identifier that does not depend on the working directory."""
         return key_of(self.argument)
 
 
 def find_sources(arguments: Iterable[str]) -> list[Source]:
     """
-    What the arguments of a command line name. A cell is called as its file; or as its folder, if folders are given and their
-    records lie in several.
+    Find the sources that arguments of a command line name. A cell has the name of its file; or of its folder, if the arguments
+    are folders and records lie in several folders.
     """
     arguments = list(arguments)
     inside = {argument: _records(Path(argument)) for argument in arguments if Path(argument).is_dir()}
@@ -78,7 +78,7 @@ def find_sources(arguments: Iterable[str]) -> list[Source]:
         stem = name if name in BUNDLED_CELLS else _stem(Path(name))
         sources.append(Source(name, int(cycle) if cycle else None, stem, stem, argument))
     sources = [each._replace(path=f"./{each.path}") if each.path.startswith(_FORMULA_HEADS) else each for each in sources]
-    return list({source.key: source for source in sources}.values())  # what is named twice is one
+    return list({source.key: source for source in sources}.values())  # each source once
 
 
 def _records(folder: Path) -> list[Path]:
@@ -86,21 +86,21 @@ def _records(folder: Path) -> list[Path]:
     The files in a folder, and in those in it, that may be records, and folders that cannot be looked into; their numbers
     count, so that 2 comes before 10. What is neither a record nor a result is named.
     """
-    records, other = [], []
+    records, ignored = [], []
 
     def unread(error: OSError) -> None:
         records.append(Path(error.filename))
 
     for parent, folders, names in os.walk(folder, onerror=unread):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        other += [Path(parent, name) for name in folders if Path(parent, name).is_symlink()]
+        ignored += [Path(parent, name) for name in folders if Path(parent, name).is_symlink()]
         for path in (Path(parent, name) for name in names if not name.startswith(".")):
             if path.name in _NO_RECORDS or not is_readable(path, (_NASA_SUFFIX,)):
-                other.append(path)
+                ignored.append(path)
             elif not is_result(path):
                 records.append(path)
     left_out = [
-        printable(path.relative_to(folder).as_posix()) for path in sorted(other, key=_by_number) if not is_result(path)
+        printable(path.relative_to(folder).as_posix()) for path in sorted(ignored, key=_by_number) if not is_result(path)
     ]
     if records and left_out:
         warnings.warn(f"{folder}: {few_of(left_out)} left out, by their names no records", stacklevel=3)
@@ -108,7 +108,7 @@ def _records(folder: Path) -> list[Path]:
 
 
 def few_of(names: Sequence[str]) -> str:
-    """The first of many names."""
+    """Return the first of many names as text."""
     return ", ".join(names[:_MOST_NAMED]) + (f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else "")
 
 
@@ -118,7 +118,7 @@ def _by_number(path: Path) -> tuple[list[list[str | int]], Path]:
 
 
 def _names(file: Path, folders: Collection[Path]) -> tuple[str, str]:
-    """Stem and cell of a file that was found in one of some folders."""
+    """Return the stem and the cell of a file in one of some folders."""
     if len(folders) == 1:
         return _stem(file), _stem(file)
     common = Path(os.path.commonpath(folders))
@@ -128,7 +128,7 @@ def _names(file: Path, folders: Collection[Path]) -> tuple[str, str]:
 
 
 def is_result(path: Path) -> bool:
-    """Whether an earlier command wrote a file: a table tells by its header, as a record may have its name."""
+    """Return whether a file is a result; a table is recognised by its header, as a record may have its name."""
     if path.suffix != ".csv":
         return path.name in (RUN, LIFE) or path.name.endswith(f"{VOLTAGE}.png")
     if not path.is_file():  # to open a pipe is to wait for it
@@ -151,37 +151,37 @@ def _stem(path: Path) -> str:
 
 
 def _plain(name: str) -> str:
-    """A name of files and of cells: what cannot be printed is a line."""
+    """Return a name of files and cells, with underscores for characters that cannot be printed."""
     return no_formula("".join(each if each.isprintable() else "_" for each in name))
 
 
 def printable(text: str) -> str:
-    """What terminals and tables may show: of what is no character, as in a name that is no UTF-8, its number."""
+    """Return a text for terminals and tables, with escapes for characters that cannot be printed."""
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def no_formula(text: str) -> str:
-    """A text that no workbook takes for a formula."""
+    """Return a text that no workbook takes for a formula."""
     return f"_{text}" if text.startswith(_FORMULA_HEADS) else text
 
 
 def record_name(stem: str, cycle: int | None) -> str:
-    """How one discharge is called in results."""
+    """Return the name of a discharge in results."""
     return stem if cycle is None else f"{stem}_{cycle:03d}"
 
 
 def is_bundled(path: str) -> bool:
-    """Whether a bundled cell is meant, and no file of its name."""
+    """Return whether a path is a bundled cell, and no file of its name."""
     return path in BUNDLED_CELLS and not Path(path).exists()
 
 
 def key_of(argument: str) -> str:
-    """What an argument of a command line names, the same wherever the command is called."""
+    """Return an identifier of an argument that does not depend on the working directory."""
     return argument if is_bundled(argument.partition(":")[0]) else os.path.abspath(argument)
 
 
 def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
-    """Read what a source names."""
+    """Read the discharges of a source."""
     path, cycle = source.path, source.cycle
     if is_bundled(path):
         columns = ("time_s", "voltage_V", "current_A", "temperature_C")
@@ -205,7 +205,9 @@ def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
         return recordings
     chosen = [recording for recording in recordings if recording.meta.get("cycle") == cycle]
     if not chosen:
-        known = sorted({recording.meta["cycle"] for recording in recordings if "cycle" in recording.meta})
-        has = f"has discharges {path}:{known[0]} .. {path}:{known[-1]}" if known else "has one discharge, without a number"
-        raise ValueError(f"{path} {has}, got {source.argument}")
+        numbers = sorted({recording.meta["cycle"] for recording in recordings if "cycle" in recording.meta})
+        contents = (
+            f"has discharges {path}:{numbers[0]} .. {path}:{numbers[-1]}" if numbers else "has one discharge, without a number"
+        )
+        raise ValueError(f"{path} {contents}, got {source.argument}")
     return chosen

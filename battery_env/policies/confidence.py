@@ -45,7 +45,6 @@ class Confidence:
     """
 
     def __init__(self, task: VoltageTask, cell: CellParameters, dt_s: float) -> None:
-        self._parameters = task.parameters
         self._offset_V = task.sensors.offset_V
         self._path: AgingPath | None = task.path
         self._sd_ratio = 1.0 if task.path is None else task.path.sd_ratio
@@ -79,7 +78,7 @@ class Confidence:
         # limit of the first voltage: a full cell, the largest offset, and errors of noise and model
         tolerance_V = self._offset_V + MOST_NOISE_SD * hypot(white_V, MISMATCH_MARGIN * mismatch_V)
         diagnosis.note(Reason.START_DIFFERS, float(record.voltage_V[0]) > rest_voltage_V(cell) + tolerance_V)
-        diagnosis.note(Reason.FEW, readings < len(self._parameters) + SPARE_SAMPLES)
+        diagnosis.note(Reason.FEW, readings < len(PARAMETER_NAMES) + SPARE_SAMPLES)
         limit_V2 = misfit_limit_V2(white_V, readings, mismatch_V, negligible_V=_LINEAR_STEP_V)
         diagnosis.note(Reason.MISFIT, not square(residual_V) <= readings * limit_V2)
         limit_sd = REACH_SD if path is None else PATH_DISTANCE_LIMIT_SD
@@ -90,15 +89,14 @@ class Confidence:
             if size > (1.0 - _ROUNDING) * limit:  # the fit clips at its limits
                 diagnosis.note(Reason.OTHER_KIND, what=quantity, ratio=size / limit)
         for k, name in enumerate(PARAMETER_NAMES):
-            if name in self._parameters:
-                diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
+            diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
         values, sds = (dict(zip(PARAMETER_NAMES, column.tolist(), strict=True)) for column in (estimate, sd))
         distances = dict(zip(PARAMETER_NAMES, distance.tolist(), strict=True))
         assumptions = Assumptions(apart=distances, is_along_path=path is not None)
-        verdict = diagnosis.verdict(values, sds, self._parameters, known=assumptions)
-        stated_sds = dict(zip(PARAMETER_NAMES, np.hypot(self._sd_ratio * fit.sd[n], common_sd).tolist(), strict=True))
+        verdict = diagnosis.verdict(values, sds, PARAMETER_NAMES, known=assumptions)
+        stated_sds = np.hypot(self._sd_ratio * fit.sd[n], common_sd).tolist()
         # the same NaN object, so that equal estimates compare equal
-        sd_q_mobile, sd_r_o = (nan if name not in self._parameters or isnan(sd) else sd for name, sd in stated_sds.items())
+        sd_q_mobile, sd_r_o = (nan if isnan(sd) else sd for sd in stated_sds)
         constants = None if path is None else _by_name(fit, n)
         return Estimate(q_mobile, r_o, sd_q_mobile, sd_r_o, **verdict._asdict(), constants=constants)
 

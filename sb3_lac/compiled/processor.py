@@ -57,7 +57,7 @@ class _SmallNetworks(CustomGraphPass):
         _passes.apply(graph)
 
     def uuid(self) -> Any:
-        """What says that code from the cache of the compiler was made in the same way."""
+        """Return the cache key of these graph passes."""
         return get_hash_for_files((__file__,))
 
 

@@ -31,16 +31,16 @@ class TracedOptimizer:
 
 
 @contextmanager
-def traced_optimizers(known: dict[th.optim.Optimizer, TracedOptimizer], owners: list[Any]) -> Iterator[None]:
-    """Have the optimizers of a model and of its networks in a form that can be traced, the known one if there is one."""
+def traced_optimizers(traced: dict[th.optim.Optimizer, TracedOptimizer], owners: list[Any]) -> Iterator[None]:
+    """Have the optimizers of a model and of its networks in a form that can be traced, that of ``traced`` if there is one."""
     named = [(owner, name, value) for owner in owners for name, value in vars(owner).items()]
-    held = [place for place in named if isinstance(place[2], th.optim.Optimizer)]
+    optimizers = [place for place in named if isinstance(place[2], th.optim.Optimizer)]
     try:
-        for owner, name, optimizer in held:
-            setattr(owner, name, known.setdefault(optimizer, TracedOptimizer(optimizer)))
+        for owner, name, optimizer in optimizers:
+            setattr(owner, name, traced.setdefault(optimizer, TracedOptimizer(optimizer)))
         yield
     finally:
-        for owner, name, optimizer in held:
+        for owner, name, optimizer in optimizers:
             setattr(owner, name, optimizer)
 
 

@@ -107,7 +107,7 @@ class CompiledUpdate:
         return call
 
     @contextmanager
-    def ready(self, model: Any, optimizers: Sequence[th.optim.Optimizer]) -> Iterator[Callable[..., Metrics]]:
+    def traceable(self, model: Any, optimizers: Sequence[th.optim.Optimizer]) -> Iterator[Callable[..., Metrics]]:
         """
         Have optimizers and networks in a form that can be compiled. All is as it was afterwards, so that models are saved as
         without compilation. What a graph would leave out is looked for each time, and leads to the update as it is.
@@ -116,9 +116,9 @@ class CompiledUpdate:
 
         policy, space = model.policy, model.policy.observation_space
         networks = [network for network in policy.children() if isinstance(network, BaseModel)]
-        known, self._left_out = self._left_out, not_in_a_graph(networks, optimizers)
+        reported, self._left_out = self._left_out, not_in_a_graph(networks, optimizers)
         if self._left_out is not None:
-            if self._left_out != known:
+            if self._left_out != reported:
                 warnings.warn(f"Updates are not compiled: a graph would leave out {self._left_out}.", stacklevel=3)
             yield model._update
             return

@@ -28,7 +28,7 @@ def check_not_negative(**values: float) -> None:
             raise ValueError(f"{name}={value} must be finite and at least 0.")
 
 
-def check_whole(**values: float) -> None:
+def check_integer(**values: float) -> None:
     """Refuse numbers of steps that make no sense."""
     for name, value in values.items():
         if value != int(value):
@@ -88,8 +88,8 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 (as in gym.Env)
     #: Names of the state variables, for pictures and errors
     state_names: tuple[str, ...]
-    # of these the first so many are drawn over time
-    _n_drawn: int | None = None
+    # of these the first so many are plotted over time
+    _n_plotted: int | None = None
     #: What ``info["error"]`` is, with its unit
     error_name: str
     #: An ``info["error"]`` up to which an episode has reached the goal
@@ -122,7 +122,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"changed_parameters has {sorted(unknown)}, which are none of {sorted(parameters)}.")
         check_positive(impulse_interval=impulse_interval)
         check_not_negative(last_actions=last_actions)
-        check_whole(impulse_interval=impulse_interval, last_actions=last_actions)
+        check_integer(impulse_interval=impulse_interval, last_actions=last_actions)
         self.state_low, self.state_high = state_low, state_high
         self.action_space = spaces.Box(-1.0, 1.0, (n_actions,), np.float32)
         self._plant_space, self.observation_space = observation_space, observation_space
@@ -158,7 +158,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
             else:
                 check_not_negative(**{name: value})
                 if name == "action_delay":
-                    check_whole(action_delay=value)
+                    check_integer(action_delay=value)
                 setattr(self, name, value)
 
     def _check_parameters(self, **parameters: float) -> None:
@@ -191,7 +191,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         return np.minimum(np.maximum(state, self.state_low), self.state_high)
 
     def _observation(self) -> np.ndarray:
-        """What can be seen of the present state, without noise."""
+        """Observe the present state, without noise."""
         return np.asarray(self.state, dtype=np.float32)
 
     def _noisy_observation(self) -> np.ndarray:
@@ -203,9 +203,9 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
             observation = np.concatenate((observation, *reversed(self._last_actions)), dtype=np.float32)
         return observation
 
-    def _info(self, **told: float) -> dict[str, Any]:
-        """What is told beside an observation."""
-        info: dict[str, Any] = {**told, "error": self._error()}
+    def _info(self, **values: float) -> dict[str, Any]:
+        """Return the entries of ``info``."""
+        info: dict[str, Any] = {**values, "error": self._error()}
         return {**info, "drawn": dict(self._sampled)} if self._sampled else info
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -278,7 +278,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         self._draw(plant_axes, states)
         right = figure.add_subfigure(figure.add_gridspec(1, 2)[1])
         state_axes, cost_axes = right.subplots(2, sharex=True, height_ratios=(2, 1))
-        for name, values in list(zip(self.state_names, states.T, strict=True))[: self._n_drawn]:
+        for name, values in list(zip(self.state_names, states.T, strict=True))[: self._n_plotted]:
             state_axes.plot(values, marker="." if len(values) == 1 else None, label=name)
         right.legend(loc="outside upper center", ncols=3, fontsize="small")
         state_axes.set_ylabel("state")

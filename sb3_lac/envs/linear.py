@@ -162,8 +162,8 @@ class LinearCostEnv(CostEnv):
         # The noise of each step adds its variance times the curvature of the value
         noise = gamma / (1 - gamma) * self.noise_std**2 * np.trace(p)
         next_states = states @ self.A.T + controls @ self.B.T
-        now = np.einsum("ni,ij,nj->n", states, self.Q, states) + np.einsum("ni,ij,nj->n", controls, self.R, controls)
-        return now + gamma * np.einsum("ni,ij,nj->n", next_states, p, next_states) + noise
+        stage_costs = np.einsum("ni,ij,nj->n", states, self.Q, states) + np.einsum("ni,ij,nj->n", controls, self.R, controls)
+        return stage_costs + gamma * np.einsum("ni,ij,nj->n", next_states, p, next_states) + noise
 
     def largest_feasible_alpha3(self, gain: np.ndarray, gamma: float, n_steps: int = 100) -> float:
         """

@@ -125,8 +125,8 @@ class OscillatorEnv(CostEnv):
     def _draw(self, axes: "Axes", states: np.ndarray) -> None:
         axes.set(xlim=(-1.0, 15.5), ylim=(-4.5, 17.5), aspect="auto")
         # The ring of proteins, each of which represses the next; their areas are the concentrations
-        places, now = [(3.9, 13.0), (6.6, 1.5), (1.2, 1.5)], self.n_steps
-        *sizes, goal = 6.0 * np.sqrt([*states[-1, 3:], self.reference(now)])
+        places, present = [(3.9, 13.0), (6.6, 1.5), (1.2, 1.5)], self.n_steps
+        *sizes, goal = 6.0 * np.sqrt([*states[-1, 3:], self.reference(present)])
         for index, place in enumerate(places):
             repressed = (index + 1) % 3
             line = {"arrowstyle": "-[, widthB=0.7, lengthB=0", "color": "0.6", "linewidth": 2}
@@ -136,7 +136,7 @@ class OscillatorEnv(CostEnv):
             axes.text(*place, self.state_names[3 + index], ha="center", va="center", fontsize="large")
         axes.plot(*places[0], "o", color="tab:green", markersize=goal, markerfacecolor="none", markeredgewidth=3)
         # The first protein until now, and its reference
-        steps, seen = np.arange(-150, 51), states[-151:, 3]
-        axes.plot(13.5 + steps / 30.0, [self.reference(now + step) for step in steps], color="tab:green", linewidth=4)
-        axes.plot(13.5 - np.arange(len(seen))[::-1] / 30.0, seen, color="tab:orange", linewidth=1.5)
-        axes.plot(13.5, seen[-1], "o", color="tab:orange", markersize=8)
+        steps, protein = np.arange(-150, 51), states[-151:, 3]
+        axes.plot(13.5 + steps / 30.0, [self.reference(present + step) for step in steps], color="tab:green", linewidth=4)
+        axes.plot(13.5 - np.arange(len(protein))[::-1] / 30.0, protein, color="tab:orange", linewidth=1.5)
+        axes.plot(13.5, protein[-1], "o", color="tab:orange", markersize=8)

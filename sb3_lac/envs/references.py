@@ -123,9 +123,9 @@ class OscillatorController(ReferenceController):
     def _actions(self, observations: np.ndarray) -> np.ndarray:
         model = self.model
         messenger, protein, repressor = observations[:, 0], observations[:, 3], observations[:, 5]
-        now, following = observations[:, 6] - model.reference(0), observations[:, 7] - model.reference(0)
+        deviation, next_deviation = observations[:, 6] - model.reference(0), observations[:, 7] - model.reference(0)
         # The next value of a sine from two of them
-        wanted_protein = self._two_cosines * following - now + model.reference(0)
+        wanted_protein = self._two_cosines * next_deviation - deviation + model.reference(0)
         next_protein = protein + model.translation * messenger - model.protein_decay * protein
         wanted_messenger = (wanted_protein - (1.0 - model.protein_decay) * next_protein) / model.translation
         dark = messenger - model.messenger_decay * messenger + model.transcription / (model.half_saturation + repressor**2)
@@ -191,9 +191,9 @@ class VehicleController(ReferenceController):
         turn = math.tau * model.speed_m_s * model.DT_S / model.PATH_PERIOD_M
         oscillator = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
         # Pi S = A Pi + B Gamma + E with no offset, (1, 0, ..., 0) Pi = 0, for columns of Pi and Gamma one below the other
-        both = np.eye(2)
-        dynamics = np.hstack((np.kron(oscillator.T, np.eye(n)) - np.kron(both, a), -np.kron(both, b)))
-        no_offset = np.hstack((np.kron(both, np.eye(1, n)), np.zeros((2, 2))))
+        identity = np.eye(2)
+        dynamics = np.hstack((np.kron(oscillator.T, np.eye(n)) - np.kron(identity, a), -np.kron(identity, b)))
+        no_offset = np.hstack((np.kron(identity, np.eye(1, n)), np.zeros((2, 2))))
         solution = np.linalg.solve(np.vstack((dynamics, no_offset)), np.concatenate((path.T.ravel(), np.zeros(2))))
         self.on_path, self.command = solution[: 2 * n].reshape(2, n), solution[2 * n :, None]
         offset, course, turning = model.WEIGHTS
@@ -235,7 +235,7 @@ def reference_controller(env: gym.Env[Any, Any]) -> ReferenceController:
     problem = env.unwrapped
     make_controller = _CONTROLLERS.get(type(problem))  # type: ignore[arg-type]
     if make_controller is None:
-        names = sorted(known.__name__ for known in _CONTROLLERS)
+        names = sorted(env_type.__name__ for env_type in _CONTROLLERS)
         raise ValueError(f"env={env} has no reference controller: it must be one of {names}.")
     assert isinstance(problem, CostEnv)
     if env.observation_space != problem.observation_space or env.action_space != problem.action_space:

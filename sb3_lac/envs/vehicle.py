@@ -101,7 +101,7 @@ class VehicleCostEnv(CostEnv):
     """
 
     state_names = ("e (m)", "psi (rad)", "v (m/s)", "r (rad/s)", "delta (rad)", "s (m)")
-    _n_drawn = 5  # the place on the path would dwarf the others, and the plant shows it
+    _n_plotted = 5  # the place on the path would dwarf the others, and the plant shows it
     error_name = "offset from the path (m)"
     error_tolerance = 0.01
     mass_kg: float = 1500.0
@@ -160,8 +160,8 @@ class VehicleCostEnv(CostEnv):
     def _observation(self) -> np.ndarray:
         assert self.state is not None
         *moving, distance = self.state.tolist()
-        here, ahead = self.curvature(distance), self.curvature(distance + self.PREVIEW_M)
-        return np.array([*moving, self.speed_m_s * here, self.speed_m_s * ahead], dtype=np.float32)
+        curvature, ahead = self.curvature(distance), self.curvature(distance + self.PREVIEW_M)
+        return np.array([*moving, self.speed_m_s * curvature, self.speed_m_s * ahead], dtype=np.float32)
 
     def _limited(self, state: np.ndarray) -> np.ndarray:
         # The path goes on where it began
@@ -210,8 +210,8 @@ class VehicleCostEnv(CostEnv):
 
     def _draw(self, axes: "Axes", states: np.ndarray) -> None:
         # The car from above, on a piece of the path around it; points of the plane are complex numbers
-        offset, heading, _, _, steering, here = states[-1]
-        distances = math.floor(here) + np.arange(-20.0, 45.0, 0.25)
+        offset, heading, _, _, steering, distance_m = states[-1]
+        distances = math.floor(distance_m) + np.arange(-20.0, 45.0, 0.25)
         swing = self.PATH_CURVATURE_1_m * self.PATH_PERIOD_M / math.tau
         headings = -swing * np.cos(math.tau * distances / self.PATH_PERIOD_M)
         middle = 0.25 * np.cumsum(np.exp(1j * headings))
@@ -220,17 +220,17 @@ class VehicleCostEnv(CostEnv):
             along = np.exp(1j * np.interp(distance, distances, headings))
             return np.interp(distance, distances, middle) + 1j * aside * along
 
-        view = place(here + 8.0, 0.0)
+        view = place(distance_m + 8.0, 0.0)
         axes.set(xlim=(view.real - 16.0, view.real + 16.0), ylim=(view.imag - 12.0, view.imag + 12.0))
         road = np.concatenate((place(distances, self.OFFSET_MAX_M), place(distances, -self.OFFSET_MAX_M)[::-1]))
         axes.fill(road.real, road.imag, color="0.8")
         dashes = place(distances, np.where(distances % 5.0 < 2.5, 0.0, np.nan))
         axes.plot(dashes.real, dashes.imag, color="tab:green", linewidth=3)
         travelled = np.unwrap(states[:, 5], period=self.PATH_PERIOD_M)
-        seen = travelled > travelled[-1] - 20.0
-        trace = place(travelled[seen] - travelled[-1] + here, states[seen, 0])
+        recent = travelled > travelled[-1] - 20.0
+        trace = place(travelled[recent] - travelled[-1] + distance_m, states[recent, 0])
         axes.plot(trace.real, trace.imag, color="tab:blue")
-        car, along = place(here, offset), np.exp(1j * (heading + np.interp(here, distances, headings)))
+        car, along = place(distance_m, offset), np.exp(1j * (heading + np.interp(distance_m, distances, headings)))
         front, rear = self.front_axle_m, self.rear_axle_m
         body = car + along * np.array([front + 0.8 + 0.9j, front + 0.8 - 0.9j, -rear - 0.8 - 0.9j, -rear - 0.8 + 0.9j])
         axes.fill(body.real, body.imag, color="tab:orange")

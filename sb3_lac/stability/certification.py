@@ -246,7 +246,7 @@ def check_bound(ultimate_bound: float | None) -> None:
 
 
 def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
-    """Check that an environment starts where it is told to."""
+    """Check that an environment starts in the stated states."""
     # Not every vector environment takes options for each of its elements
     env.set_options([{"state": starts[k % len(starts)].tolist()} for k in range(env.num_envs)])
     env.reset()
@@ -257,19 +257,19 @@ def _check_starts(env: VecEnv, starts: np.ndarray) -> None:
         env.seed(0)
         env.set_options(options)
         # Copied, for wrappers that stack frames return the same array again
-        seen = flatten(env.reset())  # type: ignore[arg-type]
-        first = seen if first is None else first
-        if not np.array_equal(seen, first):
+        observation = flatten(env.reset())  # type: ignore[arg-type]
+        first = observation if first is None else first
+        if not np.array_equal(observation, first):
             return
     raise ValueError(
-        "The environment starts in the same state whatever reset(options={'state': ...}) says: it needs a wrapper that "
-        "puts it into the state that it is given. (If it starts in the only one of starts anyway, leave starts out.)"
+        "The environment ignores reset(options={'state': ...}). Let its reset() start in options['state'], or wrap it so. "
+        "Without a choice of initial states, leave starts out."
     )
 
 
 def _stay_within(episodes: pd.DataFrame, ultimate_bound: float) -> pd.Series:
     """
-    Whether episodes survive, and the last fifth of each costs no more than a bound. It is a comparison in single precision, in
+    Tell whether episodes survive, and the last fifth of each costs no more than a bound. It compares in single precision, in
     which some vector environments hold rewards: there a cost of 0.1 is a little more than 0.1.
     """
     within = episodes["largest_late_cost"].astype(np.float32) <= np.float32(ultimate_bound)

@@ -82,12 +82,12 @@ class InputRange:
         margin = self.high - self.low + 1e-6 * np.maximum(np.abs(self.low), np.abs(self.high))
         far = ((inputs < self.low - margin) | (inputs > self.high + margin)).any(axis=0)
         if far.any():
-            shown = np.flatnonzero(far)[:5]
+            dimensions = np.flatnonzero(far)[:5]
             warnings.warn(
                 f"Observations lie far from those that the Lyapunov function was fitted on: {far.sum()} of their {len(far)} "
-                f"numbers, number {shown.tolist()} among them, which was within {self.low[shown].tolist()} and "
-                f"{self.high[shown].tolist()}, and is further outside than that is wide. Values there are made up: fit on "
-                "roll-outs that go there.",
+                f"numbers, number {dimensions.tolist()} among them, which was within {self.low[dimensions].tolist()} and "
+                f"{self.high[dimensions].tolist()}, and is further outside than that is wide. Values there are made up: fit "
+                "on roll-outs that go there.",
                 stacklevel=2,
             )
 
@@ -289,13 +289,13 @@ def traced_returns(costs: np.ndarray, next_values: np.ndarray, rows: np.ndarray,
     returns = np.empty(len(costs))
     later = np.zeros(len(rows))
     for step in range(rows.shape[1] - 1, -1, -1):
-        here = rows[:, step]
-        running = here >= 0
-        here = here[running]
+        row = rows[:, step]
+        running = row >= 0
+        row = row[running]
         goes_on = np.zeros(len(rows), dtype=bool) if step + 1 == rows.shape[1] else rows[:, step + 1] >= 0
         share = np.where(goes_on, TRACE_DECAY, 0.0)[running]
-        later[running] = costs[here] - average_cost + (1 - share) * next_values[here] + share * later[running]
-        returns[here] = later[running]
+        later[running] = costs[row] - average_cost + (1 - share) * next_values[row] + share * later[running]
+        returns[row] = later[running]
     return returns
 
 

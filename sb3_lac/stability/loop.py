@@ -55,10 +55,10 @@ def by_keyword(function: Function) -> Function:
     n_places = len(parameters) - len(names)
 
     @functools.wraps(function)
-    def of_both_forms(*arguments: Any, **given: Any) -> Any:
+    def of_both_forms(*arguments: Any, **named: Any) -> Any:
         old = dict(zip(names, arguments[n_places:], strict=False))
-        if "n_eval_episodes" in given:
-            old["n_episodes"] = given.pop("n_eval_episodes")
+        if "n_eval_episodes" in named:
+            old["n_episodes"] = named.pop("n_eval_episodes")
         if old:
             written = ", ".join(f"{name}=..." for name in old)
             warnings.warn(
@@ -67,7 +67,7 @@ def by_keyword(function: Function) -> Function:
                 stacklevel=2,
             )
         # What is one too many stays where it is, and is refused
-        return function(*arguments[:n_places], *arguments[n_places + len(names) :], **old, **given)
+        return function(*arguments[:n_places], *arguments[n_places + len(names) :], **old, **named)
 
     return of_both_forms  # type: ignore[return-value]
 
@@ -123,8 +123,8 @@ class ClosedLoop:
         values = [lyapunov.values_of_actions(take(observations, chunk), actions[chunk]) for chunk in rows]
         transitions["lyapunov"] = np.concatenate(values, dtype=np.float64)
         # A terminal state has no value
-        done = (transitions["truncated"] | transitions["terminated"]).to_numpy()
-        transitions["next_lyapunov"] = transitions["lyapunov"].shift(-1).where(~done, np.nan)
+        ends = (transitions["truncated"] | transitions["terminated"]).to_numpy()
+        transitions["next_lyapunov"] = transitions["lyapunov"].shift(-1).where(~ends, np.nan)
         if roll_outs.last_observations is not None:
             if lyapunov.of_actions:
                 last_actions, _ = self.policy.predict(roll_outs.last_observations, deterministic=self.deterministic)
@@ -220,12 +220,12 @@ def vectorized(env: gym.Env | VecEnv) -> VecEnv:
     return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
 
 
-def _share_environments(env: VecEnv, other: VecEnv) -> bool:
-    """Whether two environments are one, or have a single one in common."""
-    if env.unwrapped is other.unwrapped:
+def _share_environments(env: VecEnv, eval_env: VecEnv) -> bool:
+    """Tell whether two environments are one, or have a single one in common."""
+    if env.unwrapped is eval_env.unwrapped:
         return True
     # Those of a vector environment of somebody else may be anything
-    inner = [getattr(each.unwrapped, "envs", []) for each in (env, other)]
+    inner = [getattr(each.unwrapped, "envs", []) for each in (env, eval_env)]
     singles = [{id(getattr(single, "unwrapped", single)) for single in envs} for envs in inner]
     return not singles[0].isdisjoint(singles[1])
 

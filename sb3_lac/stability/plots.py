@@ -23,7 +23,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def is_wide(values: pd.Series | np.ndarray) -> bool:
-    """Whether values are best shown on a logarithmic scale."""
+    """Tell whether a logarithmic scale suits values."""
     return 0 < 10 * values.min() < values.max()
 
 
@@ -40,11 +40,11 @@ def format_log_axis(axis: Axis) -> None:
     axis.set_minor_formatter(_Numbers())
 
 
-def set_log_scale(axes: Axes, which: Literal["x", "y"], values: pd.Series | np.ndarray) -> None:
+def set_log_scale(axes: Axes, axis_name: Literal["x", "y"], values: pd.Series | np.ndarray) -> None:
     """Make an axis logarithmic if that suits its values."""
     if is_wide(values):
-        axes.set(**{f"{which}scale": "log"})
-        format_log_axis(axes.xaxis if which == "x" else axes.yaxis)
+        axes.set(**{f"{axis_name}scale": "log"})
+        format_log_axis(axes.xaxis if axis_name == "x" else axes.yaxis)
 
 
 def project(states: np.ndarray, x: int, y: int, names: Sequence[str] | None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -63,10 +63,10 @@ def draw_episodes(transitions: pd.DataFrame, axes: Axes) -> None:
     """Draw ``L`` along some episodes."""
     # Few enough that each line can be followed
     chosen = np.unique(np.linspace(0, transitions["episode"].max(), 8).astype(int))
-    shown = transitions[transitions["episode"].isin(chosen)]
-    for _, episode in shown.groupby("episode"):
+    of_chosen = transitions[transitions["episode"].isin(chosen)]
+    for _, episode in of_chosen.groupby("episode"):
         axes.plot(episode["step"], episode["lyapunov"], color=BLUE, alpha=0.55, lw=1.1)
-    deaths = shown[shown["terminated"]]
+    deaths = of_chosen[of_chosen["terminated"]]
     if not deaths.empty:
         axes.scatter(deaths["step"], deaths["lyapunov"], s=36, color=VERMILION, marker="x", lw=1, zorder=3, label="died")
         axes.legend(fontsize=8)
@@ -94,19 +94,19 @@ def draw_by_cost(by_cost: pd.DataFrame, alpha3: float, axes: Axes) -> None:
 def draw_calibration(transitions: pd.DataFrame, axes: Axes) -> None:
     """Draw ``L`` against the cost-to-go."""
     axes.set(xlabel="$L(s, a)$", ylabel="cost-to-go", title="L against the cost-to-go")
-    known = transitions.loc[transitions["cost_to_go"].notna(), ["lyapunov", "cost_to_go"]]
-    if known.empty:
+    calibrated = transitions.loc[transitions["cost_to_go"].notna(), ["lyapunov", "cost_to_go"]]
+    if calibrated.empty:
         axes.text(0.5, 0.5, "no episode is long enough", transform=axes.transAxes, ha="center", color="0.4")
         return
-    limits = [known.to_numpy().min(), known.to_numpy().max()]
+    limits = [calibrated.to_numpy().min(), calibrated.to_numpy().max()]
     axes.plot(limits, limits, color="0.4", lw=1, label="identity", zorder=3)
     # More points would only cover each other
-    shown = known.iloc[:: math.ceil(len(known) / 5000)]
-    axes.scatter(shown["lyapunov"], shown["cost_to_go"], s=4, color=BLUE, alpha=0.3, lw=0, rasterized=True)
+    points = calibrated.iloc[:: math.ceil(len(calibrated) / 5000)]
+    axes.scatter(points["lyapunov"], points["cost_to_go"], s=4, color=BLUE, alpha=0.3, lw=0, rasterized=True)
     # Both or none: the identity is a straight line
-    if is_wide(known["lyapunov"]) and is_wide(known["cost_to_go"]):
-        set_log_scale(axes, "x", known["lyapunov"])
-        set_log_scale(axes, "y", known["cost_to_go"])
+    if is_wide(calibrated["lyapunov"]) and is_wide(calibrated["cost_to_go"]):
+        set_log_scale(axes, "x", calibrated["lyapunov"])
+        set_log_scale(axes, "y", calibrated["cost_to_go"])
     axes.legend(fontsize=8)
 
 
@@ -193,10 +193,12 @@ def plot_region_of_attraction(starts: pd.DataFrame, x: int, y: int, names: Seque
     axes = figure.subplots()
     # The worst of those that differ in other dimensions
     order = np.argsort(-starts["low"].to_numpy(), kind="stable")
-    shown, low = points[order], starts["low"].to_numpy()[order]
+    sorted_points, low = points[order], starts["low"].to_numpy()[order]
     # tiles that nearly touch on a grid, and points where starts lie anywhere
     side_points = np.clip(200.0 / max(len(np.unique(column)) for column in points.T), 6.5, 40.0)
-    marks = axes.scatter(shown[:, 0], shown[:, 1], c=low, s=side_points**2, marker="s", cmap="viridis", vmin=0.0, vmax=1.0)
+    marks = axes.scatter(
+        sorted_points[:, 0], sorted_points[:, 1], c=low, s=side_points**2, marker="s", cmap="viridis", vmin=0.0, vmax=1.0
+    )
     never = (starts["n_attracted"] == 0).to_numpy()
     axes.scatter(points[never, 0], points[never, 1], s=20, color=VERMILION, marker="x", lw=1, label="never attracted")
     figure.colorbar(marks, ax=axes, label="probability of attraction, at least (95 % interval)")

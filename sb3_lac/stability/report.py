@@ -49,14 +49,14 @@ class Reason(Enum):
 
 
 class _Finding(NamedTuple):
-    """What speaks against a loop, what was measured of it, and the number of episodes that tell, None if these do."""
+    """A reason against a loop, its measurement, and the number of episodes that would tell, None if these do."""
 
     reason: Reason
     measured: str
     enough: int | None = None
 
 
-def _shown(interval: Interval) -> str:
+def _with_interval(interval: Interval) -> str:
     return f"{interval.value:.3g} [{interval.low:.3g}, {interval.high:.3g}]"
 
 
@@ -114,8 +114,8 @@ class LyapunovReport:
         :return: A text of some lines
         """
         episodes, transitions = len(self.episodes), len(self.transitions)
-        seen = f"{episodes} episodes, {transitions} transitions of this policy in this environment"
-        verdict = f"{self._verdict_with_residual()}\nSeen in {seen}: measured, not proved."
+        evidence = f"{episodes} episodes, {transitions} transitions of this policy in this environment"
+        verdict = f"{self._verdict_with_residual()}\nSeen in {evidence}: measured, not proved."
         return verdict if not full else f"{verdict}\n\n{self._details()}"
 
     def _details(self) -> str:
@@ -126,10 +126,10 @@ class LyapunovReport:
             f"  {'metric':<24}{'value':>12}   95 % interval",
         ]
         for name, (value, low, high) in self.metrics.items():
-            shown = "not available" if math.isnan(value) else f"{value:>12.4g}   [{low:.4g}, {high:.4g}]"
+            text = "not available" if math.isnan(value) else f"{value:>12.4g}   [{low:.4g}, {high:.4g}]"
             if math.isnan(low) and not math.isnan(value):
-                shown = f"{value:>12.4g}   not available: too few episodes have data"
-            lines.append(f"  {name:<24}{shown}")
+                text = f"{value:>12.4g}   not available: too few episodes have data"
+            lines.append(f"  {name:<24}{text}")
         if any(math.isnan(value) for value, _, _ in self.metrics.values()):
             lines.append(
                 "What is not available takes what these roll-outs do not have, like a survivor or costs that fade before the "
@@ -171,25 +171,29 @@ class LyapunovReport:
         if math.isnan(alpha3.low):
             n_costly = (self.episodes["total_cost"] > 0).sum()
             return [_Finding(Reason.FREE, f"({n_costly} of {n_episodes})", self._enough(alpha3) if n_costly > 0 else None)]
-        found = []
+        findings = []
         if not alpha3.low > 0:
-            found.append(_Finding(Reason.L_RISES, f"(largest_feasible_alpha3 is {_shown(alpha3)})", self._enough(alpha3)))
+            findings.append(
+                _Finding(Reason.L_RISES, f"(largest_feasible_alpha3 is {_with_interval(alpha3)})", self._enough(alpha3))
+            )
         if math.isnan(metrics["cost_bound_alpha3"].value):
             costly = self.by_cost.iloc[-1]
-            asked = self.alpha3 * costly["cost"]
-            drift = Interval(costly["drift"], costly["decrease_low"] - asked, costly["decrease_high"] - asked)
-            found.append(_Finding(Reason.RISES_FAR_OUT, f"(its drift there is {_shown(drift)})", self._enough(drift)))
+            required = self.alpha3 * costly["cost"]
+            drift = Interval(costly["drift"], costly["decrease_low"] - required, costly["decrease_high"] - required)
+            findings.append(
+                _Finding(Reason.RISES_FAR_OUT, f"(its drift there is {_with_interval(drift)})", self._enough(drift))
+            )
         if metrics["late_rise"].low > 0 and self._late_rise_matters():
             rise, late_cost = metrics["late_rise"].value, metrics["late_cost"].value
             late = f"(in the last fifth by {rise:.3g} above the three before, to {late_cost:.3g}, and soon above cost_bound)"
-            found.append(_Finding(Reason.COST_RISES, late))
+            findings.append(_Finding(Reason.COST_RISES, late))
         if not bound.high < start:
             enough = self._enough(Interval(bound.value - start, bound.low - start, bound.high - start))
-            found.append(_Finding(Reason.UNSETTLED, f"({start:.3g}, and cost_bound is {_shown(bound)})", enough))
-        return found
+            findings.append(_Finding(Reason.UNSETTLED, f"({start:.3g}, and cost_bound is {_with_interval(bound)})", enough))
+        return findings
 
     def _late_rise_matters(self) -> bool:
-        """Whether the cost exceeds the bound once it rises as in the last fifth again."""
+        """Tell whether the cost exceeds the bound once it rises as in the last fifth again."""
         return sum(self.metrics[name].value for name in ("late_cost", "late_rise")) > self.metrics["cost_bound"].value
 
     def _enough(self, margin: Interval) -> int | None:
@@ -207,14 +211,14 @@ class LyapunovReport:
         return math.ceil(2 * width**2 / (value**2 + (width / 2) ** 2)) * len(self.episodes)
 
     def _verdict_with_residual(self) -> str:
-        found, metrics, n_episodes = self._findings(), self.metrics, len(self.episodes)
-        decided = [each for each in found if each.enough is None]
+        findings, metrics, n_episodes = self._findings(), self.metrics, len(self.episodes)
+        decided = [each for each in findings if each.enough is None]
         if decided:
             return f"NOT SHOWN: {decided[0].reason.value} {decided[0].measured}."
-        if found:
-            most = max(each.enough for each in found if each.enough is not None)
-            why = f"{found[0].reason.value} {found[0].measured}"
-            return f"NOT SHOWN, and {SHORT}: {why}. {n_episodes} do not tell, n_episodes={most} may."
+        if findings:
+            n_needed = max(each.enough for each in findings if each.enough is not None)
+            why = f"{findings[0].reason.value} {findings[0].measured}"
+            return f"NOT SHOWN, and {SHORT}: {why}. {n_episodes} do not tell, n_episodes={n_needed} may."
         start, enough = metrics["start_cost"].value, self._enough(metrics["late_rise"]) if self._late_rise_matters() else None
         rises = "" if enough is None else f" But {SHORT}: whether {Reason.COST_RISES.value}, n_episodes={enough} may tell."
         return (

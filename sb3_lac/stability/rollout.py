@@ -45,7 +45,7 @@ def flatten(observations: Observations) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class RollOuts:
     """
-    What a policy did, one episode after the other.
+    Roll-outs of a policy, one episode after the other.
 
     :param transitions: One row per transition with ``episode``, ``step``, ``reward``, ``truncated`` and ``terminated``
     :param observations: In which the actions were taken
@@ -72,7 +72,7 @@ class _Actor:
         self.policy, self.env, self.deterministic = policy, env, deterministic
         parameters = inspect.signature(policy.predict).parameters
         takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-        self.asked = [name for name in ("state", "episode_start") if takes_all or name in parameters]
+        self._accepted = [name for name in ("state", "episode_start") if takes_all or name in parameters]
         if not takes_all and "deterministic" not in parameters:
             raise ValueError(
                 f"predict() of {type(policy).__name__} must take deterministic, which asks for the mean action. A controller "
@@ -83,11 +83,11 @@ class _Actor:
 
     def act(self, observations: Observations, episode_start: np.ndarray) -> np.ndarray:
         """Return an action for each environment."""
-        known: dict[str, Any] = {"state": self.state, "episode_start": episode_start}
-        given = {name: known[name] for name in self.asked}
+        arguments: dict[str, Any] = {"state": self.state, "episode_start": episode_start}
+        accepted = {name: arguments[name] for name in self._accepted}
         if self.masked:
-            given["action_masks"] = np.stack(self.env.env_method("action_masks"))
-        predicted = self.policy.predict(observations, deterministic=self.deterministic, **given)
+            accepted["action_masks"] = np.stack(self.env.env_method("action_masks"))
+        predicted = self.policy.predict(observations, deterministic=self.deterministic, **accepted)
         called = f"predict() of {type(self.policy).__name__} returned"
         if not isinstance(predicted, tuple) or len(predicted) != 2:
             raise ValueError(
@@ -104,7 +104,7 @@ class _Actor:
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """What happened in one step, in those environments that still have episodes to finish."""
+    """One step of those environments that still have episodes to finish."""
 
     observations: Observations
     columns: dict[str, np.ndarray]
@@ -119,7 +119,7 @@ def _steps(actor: _Actor, targets: np.ndarray, normalized_rewards: bool) -> Iter
     observations, beginnings, actor.state = env.reset(), np.ones(env.num_envs, dtype=bool), None
     while (counts < targets).any():
         active = np.flatnonzero(counts < targets)
-        seen = take(observations, active)  # type: ignore[arg-type]
+        observed = take(observations, active)  # type: ignore[arg-type]
         actions = actor.act(observations, beginnings)  # type: ignore[arg-type]
         observations, rewards, dones, infos = env.step(actions)
         if vec_normalize is not None:
@@ -127,7 +127,7 @@ def _steps(actor: _Actor, targets: np.ndarray, normalized_rewards: bool) -> Iter
         truncated = dones & np.array([info.get("TimeLimit.truncated", False) for info in infos])
         columns = {"env": np.arange(env.num_envs), "action": actions, "reward": rewards, "done": dones, "truncated": truncated}
         last_observations = [infos[i]["terminal_observation"] for i in active if truncated[i]]
-        yield _Step(seen, {name: column[active] for name, column in columns.items()}, last_observations)
+        yield _Step(observed, {name: column[active] for name, column in columns.items()}, last_observations)
         beginnings = dones
         counts += dones
         lengths = np.where(dones, 0, lengths + 1)
@@ -175,22 +175,22 @@ def roll_out(
     if not np.isfinite(transitions["reward"]).all():
         raise ValueError("The environment paid a reward that is not finite: its costs cannot be judged.")
     transitions["reward"] = transitions["reward"].astype(np.float64)
-    seen = combine(np.concatenate, [step.observations for step in steps])
+    observations = combine(np.concatenate, [step.observations for step in steps])
     last = [observation for step in steps for observation in step.last_observations]
-    for observed in [seen, *last]:
+    for observed in [observations, *last]:
         if any(np.isnan(array).any() for array in (observed.values() if isinstance(observed, dict) else [observed])):
             raise ValueError("The environment showed an observation that is NaN: nothing can be said of what follows it.")
     last_of = transitions.loc[transitions["truncated"], "env"].to_numpy()
     # From the order of time to one episode after the other
     order = np.argsort(transitions["env"], kind="stable")
     transitions = transitions.iloc[order].reset_index(drop=True)
-    done = transitions.pop("done").to_numpy()
-    transitions["episode"] = np.cumsum(done) - done
+    dones = transitions.pop("done").to_numpy()
+    transitions["episode"] = np.cumsum(dones) - dones
     transitions["step"] = transitions.groupby("episode").cumcount()
-    transitions["terminated"] = done & ~transitions["truncated"]
+    transitions["terminated"] = dones & ~transitions["truncated"]
     return RollOuts(
         transitions,
-        take(seen, order),
+        take(observations, order),
         actions[order],
         take(combine(np.stack, last), np.argsort(last_of, kind="stable")) if last else None,
     )

@@ -80,9 +80,9 @@ class Bootstrap:
         sums = np.zeros((len(values), self.n_episodes, n_levels))
         for total, value in zip(sums, values, strict=True):
             np.add.at(total, (np.asarray(episode), level), value)
-        whole = [*sums.sum(axis=1), *(np.sum(value) for value in of_episodes)]
+        totals = [*sums.sum(axis=1), *(np.sum(value) for value in of_episodes)]
         samples = [*(self.counts @ sums), *(self.counts @ value for value in of_episodes)]
-        return self._interval(float(statistic(*whole)), statistic(*samples))
+        return self._interval(float(statistic(*totals)), statistic(*samples))
 
     def _interval(self, value: float, samples: np.ndarray) -> Interval:
         defined = samples[np.isfinite(samples)]
@@ -121,52 +121,52 @@ def tightest_drift(n: np.ndarray, drift: np.ndarray, cost: np.ndarray, late_cost
     The Foster-Lyapunov condition ``E[L' - L] <= -alpha3 * c + b`` at each level of the cost, with the alpha3 and b that say
     most: those with the least ``b / alpha3``, which bounds the mean cost in the long run.
     """
-    seen, late_cost = np.asarray(n) > 0, np.asarray(late_cost)
+    occupied, late_cost = np.asarray(n) > 0, np.asarray(late_cost)
     # With t = 1 / alpha3 it is the largest of straight lines, whose least value is at t = 0, or where
     # two of them meet, or where the last one reaches that cost, or 0
     with np.errstate(divide="ignore", invalid="ignore"):
         m, c = drift / n, cost / n
-        least = np.where(np.isnan(late_cost), np.where(seen, c, np.inf).min(axis=-1), late_cost)[..., None]
+        least = np.where(np.isnan(late_cost), np.where(occupied, c, np.inf).min(axis=-1), late_cost)[..., None]
         of_pairs = (c[..., :, None] - c[..., None, :]) / (m[..., None, :] - m[..., :, None])
-        meetings = np.concatenate([of_pairs.reshape((*seen.shape[:-1], -1)), (least - c) / m, -c / m], axis=-1)
+        meetings = np.concatenate([of_pairs.reshape((*occupied.shape[:-1], -1)), (least - c) / m, -c / m], axis=-1)
         meetings = np.sort(np.where(np.isfinite(meetings) & (meetings > 0), meetings, np.inf))
         # where L falls at the largest cost, an infinite alpha3 says no more than others
-        falls = ((m < 0) | (c != np.where(seen, c, -np.inf).max(axis=-1, keepdims=True))).all(axis=-1, keepdims=True)
+        falls = ((m < 0) | (c != np.where(occupied, c, -np.inf).max(axis=-1, keepdims=True))).all(axis=-1, keepdims=True)
         t = np.concatenate([np.where(falls & np.isfinite(meetings[..., :1]), np.inf, 0.0), meetings], axis=-1)
-        lines = np.where(seen[..., None, :], t[..., None] * m[..., None, :] + c[..., None, :], -np.inf)
+        lines = np.where(occupied[..., None, :], t[..., None] * m[..., None, :] + c[..., None, :], -np.inf)
         of_t = np.where(np.isfinite(t), np.maximum(lines.max(axis=-1), least), np.inf)
         # The largest alpha3 of those that say as much
         best = np.argmax(of_t <= of_t.min(axis=-1, keepdims=True) * (1 + 1e-12), axis=-1, keepdims=True)
         bounds, t_best = (np.take_along_axis(values, best, axis=-1)[..., 0] for values in (of_t, t))
-        defined = seen.any(axis=-1) & np.isfinite(np.where(seen, m + c, 0.0)).all(axis=-1)
+        defined = occupied.any(axis=-1) & np.isfinite(np.where(occupied, m + c, 0.0)).all(axis=-1)
         return np.where(defined, bounds, np.nan), np.where(defined & (t_best > 0), 1 / t_best, np.nan)
 
 
-def levels_of_cost(known: pd.DataFrame) -> np.ndarray:
+def levels_of_cost(transitions: pd.DataFrame) -> np.ndarray:
     """Return the level of the cost that each transition belongs to."""
-    quantiles = known["cost"].quantile(np.linspace(0, 1, N_COST_LEVELS + 1)[1:-1])
-    return np.unique(np.searchsorted(quantiles, known["cost"]), return_inverse=True)[1]
+    quantiles = transitions["cost"].quantile(np.linspace(0, 1, N_COST_LEVELS + 1)[1:-1])
+    return np.unique(np.searchsorted(quantiles, transitions["cost"]), return_inverse=True)[1]
 
 
-def estimate_drift(known: pd.DataFrame, episodes: pd.DataFrame, bootstrap: Bootstrap) -> dict[str, Interval]:
+def estimate_drift(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstrap: Bootstrap) -> dict[str, Interval]:
     """Estimate the metrics of the decrease condition with a residual."""
     names = ("residual", "cost_bound", "cost_bound_alpha3")
-    if known.empty:
+    if transitions.empty:
         return {name: Interval(math.nan, math.nan, math.nan) for name in names}
-    level, episode, ones = levels_of_cost(known), known["episode"], np.ones(len(known))
-    drift, cost = (known["next_lyapunov"] - known["lyapunov"]).to_numpy(), known["cost"].to_numpy()
+    level, episode, ones = levels_of_cost(transitions), transitions["episode"], np.ones(len(transitions))
+    drift, cost = (transitions["next_lyapunov"] - transitions["lyapunov"]).to_numpy(), transitions["cost"].to_numpy()
     survived = (~episodes["terminated"]).to_numpy(dtype=np.float64)
     late = (survived * episodes["late_cost"].to_numpy(), survived)
 
-    def estimate(which: int) -> Interval:
+    def estimate(index: int) -> Interval:
         def statistic(*sums: np.ndarray) -> np.ndarray:
             n, of_drift, of_cost, of_late, n_late = sums
-            return tightest_drift(n, of_drift, of_cost, ratio(of_late, n_late))[which]
+            return tightest_drift(n, of_drift, of_cost, ratio(of_late, n_late))[index]
 
         return bootstrap.estimate_levels(statistic, level, episode, ones, drift, cost, of_episodes=late)
 
     return {
-        "residual": bootstrap.estimate_levels(largest_mean, level, episode, ones, known["difference"].to_numpy()),
+        "residual": bootstrap.estimate_levels(largest_mean, level, episode, ones, transitions["difference"].to_numpy()),
         "cost_bound": estimate(0),
         "cost_bound_alpha3": estimate(1),
     }
@@ -208,12 +208,12 @@ def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstra
     from scipy.stats import binomtest, rankdata
 
     # There is no L in a terminal state
-    known = transitions[~transitions["terminated"]]
+    running = transitions[~transitions["terminated"]]
     starts = transitions[transitions["step"] == 0]
     survivors = episodes[~episodes["terminated"]]
     long = survivors[survivors["late_rise"].notna()]
-    ones = np.ones(len(known))
-    decreases = known["lyapunov"] - known["next_lyapunov"]
+    ones = np.ones(len(running))
+    decreases = running["lyapunov"] - running["next_lyapunov"]
 
     calibrated = transitions[transitions["cost_to_go"].notna()]
     lyapunov, costs_to_go = calibrated["lyapunov"].to_numpy(), calibrated["cost_to_go"].to_numpy()
@@ -225,9 +225,9 @@ def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstra
     # A bootstrap of no deaths would have no width
     wilson = binomtest(n_deaths, len(episodes)).proportion_ci(CONFIDENCE, method="wilson")
     return {
-        "decrease": bootstrap.estimate(ratio, known["episode"], known["difference"], ones),
-        "share_decreasing": bootstrap.estimate(ratio, known["episode"], known["difference"] <= 0, ones),
-        "largest_feasible_alpha3": bootstrap.estimate(ratio, known["episode"], decreases, known["cost"]),
+        "decrease": bootstrap.estimate(ratio, running["episode"], running["difference"], ones),
+        "share_decreasing": bootstrap.estimate(ratio, running["episode"], running["difference"] <= 0, ones),
+        "largest_feasible_alpha3": bootstrap.estimate(ratio, running["episode"], decreases, running["cost"]),
         "mean_cost": bootstrap.estimate(ratio, transitions["episode"], transitions["cost"], np.ones(len(transitions))),
         "calibration_slope": compare(slope, lyapunov, costs_to_go),
         # Spearman's correlation is Pearson's of the ranks, the bootstrap keeps the ranks among all transitions
@@ -237,19 +237,19 @@ def estimate_metrics(transitions: pd.DataFrame, episodes: pd.DataFrame, bootstra
         "start_cost": bootstrap.estimate(ratio, starts["episode"], starts["cost"], np.ones(len(starts))),
         "late_cost": bootstrap.estimate(ratio, survivors.index, survivors["late_cost"], np.ones(len(survivors))),
         "late_rise": bootstrap.estimate(ratio, long.index, long["late_rise"], np.ones(len(long))),
-        **estimate_drift(known, episodes, bootstrap),
+        **estimate_drift(running, episodes, bootstrap),
     }
 
 
 def decrease_by_cost(transitions: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     """Statistics of the decrease condition at each level of the cost."""
-    known = transitions[~transitions["terminated"]]
-    levels = known.groupby(levels_of_cost(known))
+    running = transitions[~transitions["terminated"]]
+    levels = running.groupby(levels_of_cost(running))
     decrease = [bootstrap.estimate(ratio, level["episode"], level["difference"], np.ones(len(level))) for _, level in levels]
     table = levels["cost"].agg(cost_low="min", cost_high="max", cost="mean", n_transitions="size")
-    table["drift"] = (known["next_lyapunov"] - known["lyapunov"]).groupby(levels.ngroup()).mean().to_numpy()
+    table["drift"] = (running["next_lyapunov"] - running["lyapunov"]).groupby(levels.ngroup()).mean().to_numpy()
     table[["decrease", "decrease_low", "decrease_high"]] = np.reshape(decrease, (-1, 3))
-    table["share_decreasing"] = (known["difference"] <= 0).groupby(levels.ngroup()).mean().to_numpy()
+    table["share_decreasing"] = (running["difference"] <= 0).groupby(levels.ngroup()).mean().to_numpy()
     return table.reset_index(drop=True)
 
 
@@ -261,8 +261,8 @@ def relative_cost_to_go(transitions: pd.DataFrame, average_cost: float) -> np.nd
     groups = transitions.groupby("episode")
     excess = (transitions["cost"] - average_cost)[::-1]
     to_come = excess.groupby(transitions["episode"][::-1]).cumsum()[::-1]
-    seen = ~groups["terminated"].transform("any") & (2 * transitions["step"] < groups["step"].transform("size"))
-    return (to_come + groups["next_lyapunov"].transform("last")).where(seen, np.nan).to_numpy()
+    within_half = ~groups["terminated"].transform("any") & (2 * transitions["step"] < groups["step"].transform("size"))
+    return (to_come + groups["next_lyapunov"].transform("last")).where(within_half, np.nan).to_numpy()
 
 
 def cost_to_go(transitions: pd.DataFrame, gamma: float, reward_bound: float) -> np.ndarray:

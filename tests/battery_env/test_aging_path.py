@@ -340,8 +340,6 @@ class TestTask:
         for others in ({"nuisance": 0.2}, {"mismatch": 0.2}):
             with pytest.raises(ValueError, match="path says how far constants are off"):
                 VoltageTask(1, path=path, **others)
-        with pytest.raises(ValueError, match="path says how far constants are off"):
-            VoltageTask(1, parameters=["q_mobile"], path=path)
 
     def test_irregular_readings_are_drawn(self, path):
         data = TrajectoryDataset.along(path, 4, [LOAD], seed=3)

@@ -15,6 +15,7 @@ from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, CellFit, read_cell
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, JointFit
+from battery_env.estimators.search import JointSearch
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
@@ -90,14 +91,32 @@ def test_what_is_added_to_the_equilibrium_voltage_is_added_exactly(coefficients_
 
 def test_derivatives_of_the_search_are_exact(simulated):
     problem = JointFit(simulated, [True] * 3, NEW_CELL, True, 1.0)
-    x = problem.starts()[0] + 0.1 * np.random.default_rng(0).standard_normal(len(problem.sd) + 6)
-    at = problem.evaluate(x)
-    for k in range(len(x)):
-        step = 5e-5 * (np.arange(len(x)) == k)
-        for d, (more, less) in enumerate(zip(problem.evaluate(x + step), problem.evaluate(x - step), strict=True)):
-            slope = (more.residual_V - less.residual_V) / 1e-4
-            np.testing.assert_allclose(at[d].jacobian[:, k], slope, rtol=1e-4, atol=1e-6)
-            assert at[d].q_gradient_C[k] == pytest.approx((more.q_mobile - less.q_mobile) / 1e-4, rel=1e-5)
+    sd = np.array([1.0, 0.1, *problem.sd.values()])
+    for search, start in zip(problem.searches, problem.starts()[0], strict=True):
+        x = np.array(search.x_at(start, search.unknown)) + 0.1 * np.random.default_rng(0).standard_normal(len(sd)) * sd
+
+        def at(x, search=search, start=start):
+            return search.weighed_at(start, dict(zip(search.unknown, x.tolist(), strict=True)), problem.priors)
+
+        _, by_x = at(x)
+        for k, step in enumerate(2e-5 * np.diag(sd)):
+            slope = (at(x + step)[0] - at(x - step)[0]) / 4e-5
+            np.testing.assert_allclose(by_x[:, k] * sd[k], slope, rtol=1e-4, atol=4e-6)
+
+
+def test_each_discharge_has_parameters_of_its_own_and_all_have_the_same_constants(simulated):
+    problem = JointFit(simulated, [True] * 3, NEW_CELL, True, 1.0)
+    search, values = JointSearch(problem.searches, problem.priors), problem.starts()[0]
+
+    def moved(name, step, of):
+        return [at | {name: at[name] + step} if n in of else at for n, at in enumerate(values)]
+
+    _, jacobian = search.weighed(values)
+    assert jacobian.shape[1] == 3 * 2 + len(problem.sd)
+    for name, column, of in (("q_mobile", 2, [1]), ("r_o", 5, [2]), ("kn", 6, [0, 1, 2]), ("equilibrium 7", 19, [0, 1, 2])):
+        step = 1e-4 * values[0][name] or 1e-4
+        more, less = (search.weighed(moved(name, each, of))[0] for each in (step, -step))
+        np.testing.assert_allclose(jacobian[:, column] * step, 0.5 * (more - less), rtol=1e-3, atol=1e-8)
 
 
 class TestSimulated:

@@ -333,8 +333,9 @@ def test_no_capacity_is_stated_where_the_current_sensor_fails(recorded):
 def test_what_is_drawn_after_the_cut_off_is_told(recorded):
     time_s = np.append(recorded.time_s, recorded.time_s + recorded.time_s[-1] + 100.0)  # too soon for a charge between
     columns = (np.append(column, column) for column in (recorded.voltage_V, recorded.current_A))
-    with pytest.warns(UserWarning, match="Ah more are drawn after the cut-off at"):
+    with pytest.warns(UserWarning, match="Ah more are drawn after the cut-off at") as warned:
         assert np.isnan(battery_env.calibrate(Discharge(time_s, *columns)).capacity_Ah)
+    assert warned[0].filename == __file__
 
 
 @pytest.fixture(scope="module")

@@ -50,13 +50,6 @@ def test_the_last_of_a_trace_is_the_estimate():
     assert (trace.settled == (trace.reason == "")).all()
 
 
-def test_what_is_known_has_none():
-    policy = PolicyEstimator(Step(columns=slice(101, 102)), ENV_ID, parameters=["r_o"], **OPTIONS)
-    estimate = policy.estimate(whole_discharge(q_mobile=NEW_CELL.q_mobile))
-    assert estimate.settled and np.isnan(estimate.sd_q_mobile)
-    assert abs(estimate.r_o - 0.15) < 3.0 * estimate.sd_r_o < 0.02
-
-
 def test_a_policy_that_sees_no_fit_states_nothing_and_is_never_sure():
     estimate = PolicyEstimator(Step(columns=slice(0, 2)), ENV_ID).estimate(WHOLE)
     assert not estimate.settled and estimate.reason.startswith("The policy states no uncertainty")

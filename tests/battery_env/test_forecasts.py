@@ -14,7 +14,7 @@ from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.estimates import Finding
 from battery_env.lab.calibrate import calibrate as calibrate_record
-from battery_env.lab.running import forecast_end, read_load
+from battery_env.lab.running import calibrate_running, forecast_end, read_load
 from battery_env.lab.settings import Settings
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
 from battery_env.records import Samples, resample_current
@@ -382,6 +382,17 @@ class TestCommand:
         for load, expected in loads.items():
             assert life.prior_for(running, load) == pytest.approx(expected, rel=1e-3)
         assert life.prior_for(running, lambda time_s: 2.0) == pytest.approx(other, rel=1e-3)
+
+    def test_a_life_leaves_the_resistance_to_the_record(self):
+        life, running = track_life(self.discharges[:10], 2.7), self.discharges[10].until(1200.0)
+        with_life, alone = calibrate_running(running, Settings(), life=life), calibrate_record(running)
+        assert with_life.sd_q_mobile_C < 0.1 * alone.sd_q_mobile_C
+        for name in ("resistance_10s_ohm", "sd_resistance_10s_ohm"):
+            assert getattr(with_life, name) == pytest.approx(getattr(alone, name), rel=0.01)
+        assert with_life.settled_resistance_10s and not with_life.settled
+        low_ohm, median_ohm, high_ohm = np.quantile(with_life.end.resistance_10s_ohm, [0.05, 0.5, 0.95])
+        assert median_ohm == pytest.approx(alone.resistance_10s_ohm, rel=0.01)
+        assert high_ohm - low_ohm == pytest.approx(3.3 * alone.sd_resistance_10s_ohm, rel=0.1)
 
     def test_the_farther_a_load_is_from_that_of_the_life_the_less_its_constants_tell(self):
         life, running = track_life(self.discharges[:3], 2.7), self.discharges[10].until(1200.0)

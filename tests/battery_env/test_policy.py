@@ -39,12 +39,6 @@ def test_it_sees_what_the_sensors_show_and_nothing_more(data):
     assert scores["q_mobile_final"].tolist() == [NEW_CELL.q_mobile] * 5
 
 
-def test_what_is_not_searched_for_is_known(data):
-    traces = PolicyEstimator(Always(-0.1), "BatteryVoltageJoint-v0", parameters=["r_o"]).trace(data)
-    for trace, q_mobile in zip(traces, data.q_mobile, strict=True):
-        assert (trace.q_mobile == q_mobile).all() and trace.r_o[0] < NEW_CELL.r_o
-
-
 def test_bad_arguments_are_refused(data):
     with pytest.raises(ValueError, match=r"decision_s must be a positive, finite number, got 0\.0"):
         PolicyEstimator(Always(0.0), "BatteryVoltageJoint-v0", decision_s=0.0)

@@ -24,7 +24,7 @@ from battery_env.lab import batch, command_line
 from battery_env.lab.batch import attempt, workers
 from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.sources import find_sources
-from tests.faults import a_full_disk, squared_unless_it_ends_its_process
+from tests.faults import a_full_disk, squared_after_a_while, squared_unless_it_ends_its_process
 from tests.sweeps import sweep
 from tests.terminal import write
 
@@ -113,6 +113,16 @@ def test_a_call_that_its_process_does_not_survive_is_an_error_and_all_others_are
         made = [pool.submit(squared_unless_it_ends_its_process, n, (1,)) for n in range(5)]
         assert [isinstance(each.exception(), BrokenExecutor) for each in made] == [n == 1 for n in range(5)]
         assert [each.result() for n, each in enumerate(made) if n != 1] == [0, 4, 9, 16]
+
+
+def test_a_lost_process_takes_no_other_call_with_it(tmp_path):
+    log = tmp_path / "begun"
+    with workers(2) as pool:
+        slow = pool.submit(squared_after_a_while, 3, log)
+        wait_for(log.exists)
+        lost = pool.submit(squared_unless_it_ends_its_process, 1, (1,))
+        assert isinstance(lost.exception(), BrokenExecutor)
+        assert slow.result() == 9 and log.read_bytes() == b"x"
 
 
 @pytest.fixture(scope="module")

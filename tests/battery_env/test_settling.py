@@ -5,10 +5,20 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from battery_env import NEW_CELL, Discharge, RecordModel, initial_state, load_nasa_discharges, simulate
+from battery_env import (
+    NEW_CELL,
+    Discharge,
+    RecordModel,
+    calibrate,
+    initial_state,
+    load_nasa_discharges,
+    simulate,
+    track_life,
+)
 from battery_env.estimates.findings import CODES, Doubt, Finding, Reason, findings_of, is_only_imprecise
 from battery_env.estimators import CellFit, Estimate, LeastSquares, fit_cell
 from battery_env.estimators.verdict import Assumptions, Diagnosis
+from battery_env.lab.running import calibrate_running
 from battery_env.lab.settings import Settings
 from battery_env.records import DischargeStart, expected_current
 from tests.sweeps import sweep
@@ -115,7 +125,7 @@ VERDICTS = {
         {"parameters": ["q_mobile"], "cell": NEW_CELL.replace(r_o=0.12), "mismatch_V": 0.0, "voltage_noise_V": 0.005}, MISFIT,
     ),
     "prior beside the knee": (discharged(2.9, 4400.0, 0.24), {"prior_q_mobile_C": (5280.0, 69.0)}, "q_max rests on"),
-    "wrong prior of q_mobile": (WHOLE, {"prior_q_mobile_C": (5400.0, 20.0)}, "The prior of q_max contradicts"),
+    "wrong prior of q_mobile": (WHOLE, {"prior_q_mobile_C": (5400.0, 20.0)}, "q_max is 1.67 Ah by the record, outside of"),
     "prior of q_mobile": (
         changed(WHOLE, slice(120)), {"prior_q_mobile_C": (6100.0, 60.0)}, "q_max rests on its prior: the record alone"
     ),
@@ -219,6 +229,7 @@ MEASURED = {
         "least_fitted_A most_fitted_A fault_s dropout_s gap_start_s gap_end_s drawn_C moved_C missed_C".split(), 0.2
     ),
     **dict.fromkeys("initial_soc switches ratio after_s step_s measured_ohm model_ohm apart_sd".split(), 0.2),
+    **dict.fromkeys("record_Ah least_Ah most_Ah".split(), 0.2),
 }
 
 
@@ -232,6 +243,39 @@ def test_a_finding_keeps_what_its_text_names_and_says_it(row):
     for name in found.measured:  # and no more than that
         with pytest.raises(KeyError):
             str(replace(found, measured={each: value for each, value in found.measured.items() if each != name}))
+
+
+def scaled(record: Discharge, by: float) -> Discharge:
+    """Its current is read with a gain."""
+    return Discharge(record.time_s, record.voltage_V, by * record.current_A, record.temperature_C)
+
+
+@pytest.mark.parametrize("number", [9, 84, 167])
+def test_a_nominal_capacity_and_a_life_contradict_a_cell_of_another_size(number):
+    *before, whole = load_nasa_discharges("B0005")[number - 3 : number + 1]
+    life = track_life(before, 2.7)
+    for gain in (0.25, 3.0, 4.0):
+        record = scaled(whole, gain)
+        for found in (calibrate(record, nominal_Ah=2.0), calibrate_running(record, Settings(), life=life)):
+            (each,) = (each for each in found.findings if each.code == "prior_wrong")
+            assert not (found.settled or found.settled_q_mobile or found.settled_resistance_10s or found.settled_r_o)
+            said = each.measured
+            assert not said["least_Ah"] < said["record_Ah"] < said["most_Ah"] and not is_only_imprecise(found.findings)
+            assert said["record_Ah"] == pytest.approx(gain * whole.loaded_part(2.7).charge_C / 3600.0, rel=0.2)
+    assert calibrate(whole, nominal_Ah=2.0).findings == calibrate(whole).findings
+    assert not calibrate_running(whole, Settings(nominal_Ah=2.0), life=life).findings
+
+
+def test_what_a_cell_new_or_worn_holds_fits_its_nominal_capacity():
+    settings, new_C = Settings(nominal_Ah=2.0), 7560.0
+    fits = {share: not settings.other_size(Estimate(share * new_C, 0.1, 0.01 * share * new_C), 0.0) for share in (0.5, 1.2)}
+    assert all(fits.values())
+    # above that what was drawn counts, as other constants move q_max; and one that is not known contradicts nothing
+    assert not settings.other_size(Estimate(1.5 * new_C, 0.1, 50.0), 7200.0)
+    assert settings.other_size(Estimate(1.5 * new_C, 0.1, 50.0), 10_800.0)
+    assert settings.other_size(Estimate(0.3 * new_C, 0.1, 30.0), 2000.0)
+    assert not settings.other_size(Estimate(0.3 * new_C, 0.1, 0.3 * new_C), 2000.0)
+    assert not Settings().other_size(Estimate(0.3 * new_C, 0.1, 30.0), 2000.0)
 
 
 def test_the_table_is_short_and_in_order():

@@ -13,7 +13,6 @@ from battery_env.trajectories import TrajectoryDataset
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
 #: All environments, with short episodes.
 CASES = [(env_id, {"episode_steps": 4}) for env_id in TASKS]
-CASES += [("BatteryVoltageJoint-v0", {"episode_steps": 4, "parameters": ["r_o"]})]
 # whatever draws at random
 NOISY = {"initial_perturbation": 3.0, "continue_probability": 0.5, "first_sample_probability": 0.3}
 

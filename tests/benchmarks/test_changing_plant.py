@@ -13,7 +13,7 @@ IDS = list(changing_plant.PARAMETERS)
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_ranges_hold_what_policies_are_tried_with_and_the_plant_as_it_is_known_and_not_what_is_outside(env_id):
-    ranges = changing_plant.drawn(env_id)
+    ranges = changing_plant.ranges_of(env_id)
     env = gym.make(env_id, drawn=ranges)
     assert env.reset(seed=0)[1]["drawn"].keys() == ranges.keys()
     name, (low, high), beyond = changing_plant.PARAMETERS[env_id]

@@ -10,14 +10,16 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch as th
-from rl_zoo3 import ALGOS
+from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from battery_env import ClosedForm, evaluate
-from benchmarks import compare, contests
-from benchmarks.study import write_json
-from benchmarks.training import Recipe, finished_model, made_by, record_file
+from benchmarks import compare, contests, runs
+from benchmarks.runs import Run, made_by, record_file
+from benchmarks.study import table_file, write_json
+from benchmarks.zoo_runs import zoo_run
+from sb3_lac import LAC
 from tests.sweeps import sweep
 
 ENV_ID = "BatteryRo-v0"
@@ -55,8 +57,8 @@ def small(tmp_path, monkeypatch):
     monkeypatch.setattr(contests, "_BRIEF_VOLTAGE_TRAJECTORIES", 1)
 
 
-def recipe(algo="lac", timesteps=400, evaluations=2, **others):
-    return Recipe.of(algo, ENV_ID, 0, timesteps, evaluations=evaluations, **others)
+def run_of(algo="lac", timesteps=400, **others):
+    return zoo_run(algo, ENV_ID, 0, timesteps, **others)
 
 
 def command(*others):
@@ -74,15 +76,15 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
     assert (table["timesteps"][:3] == 400).all() and table["mape_percent"].iloc[3] < 1e-9
     assert (table["resumed"][:3] == 0).all()
     shown = capsys.readouterr().out
-    assert re.search(rf"\| BatteryRo-v0 +\| r_o +\| LAC +\| {recipe().digest} +\| 400 +\| 1 ", shown)
+    assert re.search(rf"\| BatteryRo-v0 +\| r_o +\| LAC +\| {run_of().digest} +\| 400 +\| 1 ", shown)
     assert "Interrupted" not in shown
     for name in ("inferred.png", "inferred.csv", "scores.csv", "learning.png", "learning.csv", "learning.json"):
         assert (out / f"{ENV_ID}_{name}").stat().st_size > 0
     scores = pd.read_csv(out / f"{ENV_ID}_scores.csv")
     assert (scores["start_off_r_o_mape_percent"] != scores["r_o_mape_percent"]).all()
     logs = {path.parent.name for path in (out / "tensorboard" / ENV_ID).rglob("events*")}
-    assert logs == {f"{algo.upper()}_seed0_{recipe(algo).digest}" for algo in ("lac", "sac", "td3")}
-    assert {path.name for path in (out / ENV_ID).iterdir()} == {recipe(algo).name for algo in ("lac", "sac", "td3")}
+    assert logs == {f"{algo.upper()}_seed0_{run_of(algo).digest}" for algo in ("lac", "sac", "td3")}
+    assert {path.name for path in (out / ENV_ID).iterdir()} == {run_of(algo).name for algo in ("lac", "sac", "td3")}
     assert not list(out.rglob("checkpoint*"))
 
     for log in (out / "tensorboard" / ENV_ID).iterdir():
@@ -92,25 +94,25 @@ def test_a_comparison_writes_table_figures_and_logs(tmp_path, capsys):
         assert "custom_scalars__config__" in tags["tensors"] and "eval/mean_reward" in tags["scalars"]
 
     record = json.loads((out / "compare.json").read_text())
-    made_by = record["configuration"]["recipes"][recipe("sac").digest]
-    assert (made_by["algo"], made_by["env_id"], made_by["timesteps"], made_by["evaluations"]) == ("sac", ENV_ID, 400, 2)
-    assert made_by["hyperparameters"]["batch_size"] == 16 and made_by["arguments"]["tau"] == 0.005
+    made_by = record["configuration"]["recipes"][run_of("sac").digest]
+    assert (made_by["kind"], made_by["task"], made_by["timesteps"]) == ("stable_baselines3:SAC", ENV_ID, 400)
+    assert made_by["settings"]["batch_size"] == 16 and made_by["defaults"]["tau"] == 0.005
     (run,) = made_by["runs"]
     assert (run["seed"], run["resumed"]) == (0, 0) and {"torch", "sb3_lac"} <= set(run["versions"])
 
 
 @pytest.fixture
 def finished(monkeypatch):
-    """The recipes of runs that only leave what a training would have left."""
+    """Runs that only leave what a training would have left."""
     trained = []
 
-    def part(recipe, out):
-        chosen = Recipe(**recipe)
+    def part(algo, source, run, out, evaluations):
+        chosen = Run(**run)
         trained.append(chosen)
-        record = {"recipe": recipe, "versions": {"torch": "2"}, "resumed": 2 * chosen.seed, "updates": 3}
+        record = {"run": run, "defaults": {}, "versions": {"torch": "2"}, "resumed": 2 * chosen.seed, "updates": 3}
         record |= {"timesteps": chosen.timesteps, "training_minutes": 0.5}
-        write_json(record_file(chosen, out / chosen.env_id / chosen.name), record)
-        scores = evaluate(ClosedForm(), contests.held_out_trajectories(chosen.env_id))
+        write_json(record_file(chosen, out / chosen.task / chosen.name), record)
+        scores = evaluate(ClosedForm(), contests.held_out_trajectories(chosen.task))
         scores["start_off_r_o_mape_percent"] = scores["r_o_mape_percent"]
         history = {"timesteps": [chosen.timesteps], "mape_percent": [1.0], "mape_percent_worst": [2.0]}
         return {"scores": scores, "learning": pd.DataFrame(history)}
@@ -126,25 +128,26 @@ def test_a_finished_run_stands_for_its_own_recipe_only(tmp_path, finished, capsy
     compare.main(command("--algos", "lac"))
     compare.main(command("--algos", "lac"))
     assert len(finished) == 1
-    before = recipe().digest
+    before = run_of().digest
     (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG.replace("batch_size: 16", "batch_size: 32"))
     differing = ["--hyperparams", "lac.n_envs:2", "n_envs:1", "learning_rate:1e-3", f"{ENV_ID}.learning_rate:lin_1e-3"]
     for changed in ([], differing, ["--timesteps", "500"], ["--defaults", "--timesteps", "300"], ["--evaluations", "1"]):
         compare.main([*command("--algos", "lac"), *changed])
-    assert len(finished) == 6
-    expected = {**finished[1].hyperparameters, "learning_rate": "lin_1e-3", "n_envs": 2}
-    assert expected == finished[2].hyperparameters
+    # how often a policy is evaluated meanwhile makes no other one
+    assert len(finished) == 5
+    expected = {**finished[1].settings, "learning_rate": "lin_1e-3", "n_envs": 2}
+    assert expected == finished[2].settings
     table = pd.read_csv(tmp_path / "out" / "compare.csv", dtype={"recipe": str})[:-1]
     assert table["recipe"].is_unique and before in set(table["recipe"])
-    assert sorted(table["timesteps"]) == [300, 400, 400, 400, 400, 500]
-    assert list(table["hyperparameters"]) == ["zoo_configs"] * 5 + ["defaults"]
+    assert sorted(table["timesteps"]) == [300, 400, 400, 400, 500]
+    assert list(table["hyperparameters"]) == ["zoo_configs"] * 4 + ["defaults"]
     recipes = json.loads((tmp_path / "out" / "compare.json").read_text())["configuration"]["recipes"]
     assert [recipes[digest]["timesteps"] for digest in table["recipe"]] == list(table["timesteps"])
-    assert recipes[before]["hyperparameters"]["batch_size"] == 16
-    assert recipes[recipe().digest]["hyperparameters"]["batch_size"] == 32
+    assert recipes[before]["settings"]["batch_size"] == 16
+    assert recipes[run_of().digest]["settings"]["batch_size"] == 32
     # in tables and figures each has a name of its own
     names = set(pd.read_csv(tmp_path / "out" / f"{ENV_ID}_learning.csv")["algo"])
-    assert names == {"LAC defaults", *(f"LAC {digest}" for digest in table["recipe"][:5])}
+    assert names == {"LAC defaults", *(f"LAC {digest}" for digest in table["recipe"][:4])}
     shown = capsys.readouterr().out
     assert all(name in shown for name in names)
 
@@ -166,16 +169,20 @@ def test_seeds_are_one_row_and_continued_runs_are_named(tmp_path, finished, caps
     }
 
 
-@pytest.mark.parametrize("algo", sweep("lac", "td3"))
+def part(run, out, evaluations):
+    return compare.part(run.algorithm, "zoo_configs", asdict(run), out, evaluations)
+
+
+@pytest.mark.parametrize("algo", sweep(LAC, TD3))
 def test_defaults_are_the_line_as_typed(algo, tmp_path, monkeypatch):
     captured = []
     monkeypatch.setattr(
         contests, "evaluate", lambda estimator, data: captured.append(estimator.policy) or evaluate(estimator, data)
     )
-    chosen = recipe(algo, timesteps=110, evaluations=1, defaults=True)
-    assert chosen.name.startswith(f"{algo}_defaults_seed0_")
-    compare.part(asdict(chosen), tmp_path)
-    typed = ALGOS[algo]("MlpPolicy", ENV_ID, seed=0, device="cpu").learn(110)
+    chosen = run_of(algo.__name__.lower(), timesteps=110, defaults=True)
+    assert chosen.algorithm == f"{algo.__name__} defaults"
+    part(chosen, tmp_path, 1)
+    typed = algo("MlpPolicy", ENV_ID, seed=0, device="cpu").learn(110)
     assert typed._n_updates == captured[-1]._n_updates == 10
     for ours, expected in zip(captured[-1].policy.parameters(), typed.policy.parameters(), strict=True):
         assert th.equal(ours, expected)
@@ -198,20 +205,21 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint_and_says_so(tmp_path, mo
                 raise KeyboardInterrupt
             return True
 
-    chosen = recipe(evaluations=4)
+    monkeypatch.setattr(runs, "CHECKPOINT_EVERY_S", 0.0)
+    chosen = run_of()
     folder = tmp_path / ENV_ID / chosen.name
-    # the first interruption is before the first checkpoint: what follows is a run from the start
-    for at in (60, 240, 340, None):
+    # what is lost is what came after the last roll-out
+    for at in (4, 240, 340, None):
         with monkeypatch.context() as patch:
             patch.setattr(compare, "EvalCallback", lambda *args, at=at, **kwargs: Interrupt(at))
             with nullcontext() if at is None else pytest.raises(KeyboardInterrupt):
-                found = compare.part(asdict(chosen), tmp_path)
-        assert finished_model(chosen, folder) is None or at is None
-    assert started_at == [0, 0, 200, 300]
+                found = part(chosen, tmp_path, 4)
+        assert record_file(chosen, folder).exists() == (at is None)
+    assert started_at == [0, 0, 236, 336]
     assert list(found["learning"]["timesteps"]) == [100, 200, 300, 400]
     record = made_by(chosen, folder)
     assert record["timesteps"] == 400 and record["updates"] > 0 and record["training_minutes"] > 0
-    assert record["resumed"] == 2 and Recipe(**record["recipe"]) == chosen
+    assert record["resumed"] == 3 and Run(**record["run"]) == chosen
 
 
 VOLTAGE_CONFIG = """
@@ -236,7 +244,7 @@ def test_voltage_only_tasks_are_compared_under_sensors_beside_their_peers(tmp_pa
     assert (least_squares < table.loc[table["calibrator"] == "LAC", "r_o_second_half_percent"].min()).all()
     assert least_squares.iloc[1] > least_squares.iloc[0]
     assert re.search(r"\| BatteryVoltageJoint-v0 +\| 5 mV noise +\| LAC ", capsys.readouterr().out)
-    published = ROOT / "docs" / "results" / "voltage" / "BatteryVoltageJoint-v0_scores.csv"
+    published = table_file(ROOT / "docs" / "results" / "voltage", "BatteryVoltageJoint-v0_scores")
     assert set(pd.read_csv(out / "BatteryVoltageJoint-v0_scores.csv")) <= set(pd.read_csv(published, nrows=1))
     assert len(pd.read_csv(out / "BatteryVoltageJoint-v0_r_o_learning.csv")) == 2
     assert json.loads((out / "BatteryVoltageJoint-v0.json").read_text())["configuration"]["recipes"]
@@ -273,12 +281,12 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (["--algos", "lack"], "lack is no algorithm of the RL Zoo; choose from"),
+        (["--algos", "lack"], "lack is no algorithm; choose from"),
         (["--algos", "no_such_module:Mine"], "No module named 'no_such_module'"),
-        (["--algos", "benchmarks.training:Mine"], "has no attribute 'Mine'"),
-        (["--algos", "benchmarks.training:Recipe"], "must be a subclass of Stable-Baselines3's BaseAlgorithm"),
-        (["--algos", "dqn", "--defaults"], "dqn on BatteryRo-v0: The algorithm only supports"),
-        (["--algos", "ppo_lstm", "--defaults"], "policies with a memory cannot be scored here"),
+        (["--algos", "benchmarks.runs:Mine"], "has no attribute 'Mine'"),
+        (["--algos", "benchmarks.runs:Run"], "must be a subclass of Stable-Baselines3's BaseAlgorithm"),
+        (["--algos", "dqn", "--defaults"], "DQN defaults on BatteryRo-v0: The algorithm only supports"),
+        (["--algos", "recurrent_ppo", "--defaults"], "policies with a memory cannot be scored here"),
         (["--algos", "tqc"], "tqc.yml"),
         (["--envs", "BatteryR-v0"], "Environment `BatteryR` doesn't exist"),
         (["--envs", "no_such_module:Mine-v0"], "no_such_module:Mine-v0 is no environment: No module named"),
@@ -286,8 +294,8 @@ def test_algorithms_of_the_zoo_and_ones_own_are_compared_in_any_environment(tmp_
         (["--seeds", str(2**32)], "a seed must lie within 0 .. 2**32 - 1, got 4294967296"),
         (["--hyperparams", "n_envs=1"], "--hyperparams takes NAME:VALUE, like n_envs:1, got n_envs=1"),
         (["--hyperparams", "tqc.n_envs:1"], "--hyperparams has some of tqc, which is not compared"),
-        (["--hyperparams", "n_env:1"], "lac on BatteryRo-v0: LAC.__init__() got an unexpected keyword argument 'n_env'"),
-        (["--hyperparams", "gamma:2"], "lac on BatteryRo-v0: gamma=2.0 must lie within 0 .. 1"),
+        (["--hyperparams", "n_env:1"], "LAC on BatteryRo-v0: LAC.__init__() got an unexpected keyword argument 'n_env'"),
+        (["--hyperparams", "gamma:2"], "LAC on BatteryRo-v0: gamma=2.0 must lie within 0 .. 1"),
         (["--timesteps", "40"], "starts to learn after 40 steps (learning_starts): timesteps=40 must be more"),
     ],
 )
@@ -302,10 +310,10 @@ def test_nonsense_on_the_command_line_is_refused_before_any_training(wrong, mess
 def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatch, capsys):
     finish = compare.part
 
-    def part(recipe, out):
-        if recipe["algo"] == "sac":
+    def part(algo, source, run, out, evaluations):
+        if algo == "sac":
             raise ZeroDivisionError
-        return finish(recipe, out)
+        return finish(algo, source, run, out, evaluations)
 
     monkeypatch.setattr(compare, "part", part)
     with pytest.raises(ZeroDivisionError):

@@ -11,7 +11,7 @@ import pytest
 from battery_env.trajectories import TrajectoryDataset
 from benchmarks import direct_mapping
 from benchmarks.direct_mapping import DirectMapping, draw_pairs
-from benchmarks.training import Recipe
+from benchmarks.zoo_runs import zoo_run
 from tests.policies import Always
 
 
@@ -53,15 +53,14 @@ class TestDivisions:
         asked = []
         monkeypatch.setattr(direct_mapping, "train_or_load", lambda *arguments: asked.append(arguments))
         direct_mapping.train_policy("lac", parameter, 3, 10, tmp_path)
-        ((recipe, _),) = asked
-        assert (recipe.algo, recipe.seed, recipe.timesteps) == ("lac", 3, 1600)
-        env = gym.make(recipe.env_id, **recipe.hyperparameters["env_kwargs"]).unwrapped
+        ((run, _),) = asked
+        assert (run.kind, run.seed, run.timesteps) == ("sb3_lac:LAC", 3, 1600)
+        env = gym.make(run.task, **run.environment).unwrapped
         train, _ = direct_mapping.divided(parameter, "parameter")
         np.testing.assert_array_equal(env.task.dataset.q_mobile, train.q_mobile)
         np.testing.assert_array_equal(env.task.dataset.r_o, train.r_o)
         np.testing.assert_array_equal(load_W(env.task.dataset), load_W(train))
-        tuned = Recipe.of("lac", recipe.env_id, 3).hyperparameters["env_kwargs"]
-        assert tuned.items() <= recipe.hyperparameters["env_kwargs"].items()
+        assert zoo_run("lac", run.task, 3).environment.items() <= run.environment.items()
 
 
 class TestDirectMapping:

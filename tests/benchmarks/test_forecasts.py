@@ -1,10 +1,13 @@
 """The study of forecasts, on a few discharges."""
 
+from pathlib import Path
+
 import pandas as pd
 import pytest
 
 from battery_env.records.discharge import load_nasa_discharges
 from benchmarks import forecasts
+from benchmarks.study import table_file
 
 
 @pytest.mark.attacks
@@ -24,7 +27,7 @@ def test_the_study_writes_its_tables(monkeypatch, tmp_path, capsys):
 
 
 def test_published_intervals_of_nine_of_ten_hold_where_life_and_load_are_known():
-    rows = pd.read_csv("docs/results/forecasts/discharges.csv").set_index("method")
+    rows = pd.read_csv(table_file(Path("docs/results/forecasts"), "discharges")).set_index("method")
     # at another load of most cells by the constants of a new one, and of all by constants that were fitted
     fitted = pd.concat([rows.loc[forecasts.OWN_FIT], rows.loc[forecasts.FORECAST].query("load == '2 A'")])
     covered = fitted.groupby(["data", "load"])["covered"].mean()
@@ -35,7 +38,7 @@ def test_published_intervals_of_nine_of_ten_hold_where_life_and_load_are_known()
 
 @pytest.mark.attacks
 def test_the_life_that_remains_is_compared_with_the_measured_one(tmp_path):
-    published = pd.read_csv("docs/results/real_cells/discharges.csv")
+    published = pd.read_csv(table_file(Path("docs/results/real_cells"), "discharges"))
     # the second half of its life
     table = published[published["cell"] == "B0005"][84:].reset_index(drop=True).assign(reason="", valid=True, lasted_share=1.0)
     life = forecasts.Life(table, 0.0, 0.0, 0.0, None, None).after(len(table))

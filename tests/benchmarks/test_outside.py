@@ -71,9 +71,9 @@ def test_the_study_trains_writes_and_goes_on(tmp_path, monkeypatch, capsys):
     other = tmp_path / "other.csv"
     done.assign(seed=done["seed"] + 2).to_csv(other, index=False)
     outside.main([*command, "--seeds", "1", "2", "3", "--merge", str(other), "--redraw"])
-    assert len(Rows(out / "runs.csv").read()) == 8 and "| 3 " in (out / "outside.md").read_text()
+    assert len(Rows(out).read()) == 8 and "| 3 " in (out / "outside.md").read_text()
     # an algorithm that lacks a seed is no part of a table
-    Rows(out / "runs.csv").add(done[:1].assign(seed=5))
+    Rows(out).add(done[:1].assign(seed=5))
     with pytest.raises(SystemExit, match="No algorithm has all of its seeds"):
         outside.main([*command, "--seeds", "1", "9", "--redraw"])
     outside.main([*command, "--seeds", "1", "5", "--redraw"])

@@ -10,7 +10,6 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from benchmarks import control, published, stabilisation
-from benchmarks.training import set_up
 from benchmarks.two_rate_sac import TwoRateSAC
 from sb3_lac.envs import reference_controller
 from tests.sweeps import sweep
@@ -27,7 +26,7 @@ def test_trained_policies_are_judged(tmp_path, monkeypatch, train_nothing, capsy
     monkeypatch.setattr(published, "DISTURBANCES", few)
     command = ["--timesteps", "2000", "--episodes", "1", "--jobs", "1", "--out", str(tmp_path)]
     published.main([*command, "--seeds", "0"])
-    algos = ("published_lac", "benchmarks.two_rate_sac:TwoRateSAC")
+    algos = ("sb3_lac:PublishedLAC", "benchmarks.two_rate_sac:TwoRateSAC")
     assert asked == [(algo, env_id, 0, 2000) for env_id in published.TIMESTEPS for algo in algos]
     results, learning = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("published", "learning"))
     for env_id, disturbances in published.DISTURBANCES.items():
@@ -41,9 +40,9 @@ def test_trained_policies_are_judged(tmp_path, monkeypatch, train_nothing, capsy
 
 
 @pytest.mark.parametrize("policy", sweep("lac", "sac"))
-def test_settings_are_those_of_the_paper_and_rates_fall_apart(policy, tmp_path):
-    recipe = published.contender(policy, "Oscillator-v0").recipe("Oscillator-v0", 0, 1100)
-    _, model = set_up(recipe, tmp_path)
+def test_settings_are_those_of_the_paper_and_rates_fall_apart(policy):
+    run = published.contender(policy, "Oscillator-v0").run("Oscillator-v0", 0, 1100)
+    model = run.model(run.environments())
     model.learn(1100)
     assert model._n_updates == 80 and (model.gamma, model.tau, model.batch_size) == (0.995, 0.005, 256)
     assert model.ent_coef == {"lac": "auto_2", "sac": "auto_1.0"}[policy]

@@ -26,18 +26,18 @@ def steps_so_far(model, task):
 
 @pytest.fixture
 def trainer(tmp_path):
-    return Trainer(tmp_path / "rows" / "runs.csv", tmp_path / "checkpoints", steps_so_far)
+    return Trainer(tmp_path / "rows", tmp_path / "checkpoints", steps_so_far)
 
 
 def rows_of(trainer):
-    return pd.read_csv(trainer.file)
+    return Rows(trainer.folder).read()
 
 
 def test_a_training_is_done_once_and_its_row_says_what_was_run(trainer):
     trainer(RUN)
-    written = trainer.file.read_text()
+    written = (trainer.folder / "runs.csv").read_text()
     trainer(RUN)
-    assert trainer.file.read_text() == written
+    assert (trainer.folder / "runs.csv").read_text() == written
     (row,) = rows_of(trainer).to_dict("records")
     assert [row[name] for name in ("task", "algorithm", "seed", "timesteps")] == ["LinearCost-v0", "lac", 3, 60]
     assert row["package"].startswith("sb3_lac 0.") and "dev" not in row["package"] and "net_arch" in row["configuration"]
@@ -45,8 +45,8 @@ def test_a_training_is_done_once_and_its_row_says_what_was_run(trainer):
     assert row["resumed"] == 0 and row["minutes"] > 0 and "torch" in row["versions"]
     assert not list(trainer.checkpoints.glob("*.zip"))
     for other in (replace(RUN, seed=4), replace(RUN, timesteps=61), replace(RUN, settings={**SETTINGS, "tau": 0.1})):
-        assert not Rows(trainer.file).has(other) and other.name != RUN.name
-    assert not Rows(trainer.file).has(replace(RUN, environment={"noise_std": 0.0}))
+        assert not Rows(trainer.folder).has(other) and other.name != RUN.name
+    assert not Rows(trainer.folder).has(replace(RUN, environment={"noise_std": 0.0}))
 
 
 def test_a_class_is_known_by_its_release_and_not_by_its_files():
@@ -72,7 +72,8 @@ def test_a_training_that_was_killed_goes_on_from_its_checkpoint(trainer, monkeyp
 
     with pytest.raises(Killed):
         replace(trainer, judge=judge)(run)
-    assert not trainer.file.exists() and [path.name for path in trainer.checkpoints.glob("*.zip")] == [f"{run.name}.zip"]
+    (checkpoint,) = trainer.checkpoints.glob("*.zip")
+    assert rows_of(trainer).empty and checkpoint.name == f"checkpoint_{run.name}.zip"
     replace(trainer, judge=judge)(run)
     (row,) = rows_of(trainer).to_dict("records")
     assert row["resumed"] == 1 and not list(trainer.checkpoints.glob("*.zip"))
@@ -87,7 +88,7 @@ def test_at_the_deadline_a_training_stops_with_a_checkpoint_and_none_begins(trai
     clocks = SimpleNamespace(time=lambda: next(clock, 200.0), perf_counter=time.perf_counter)
     monkeypatch.setattr(runs, "time", clocks)
     stopping(RUN)
-    assert not trainer.file.exists() and len(list(trainer.checkpoints.glob("*.zip"))) == 1
+    assert rows_of(trainer).empty and len(list(trainer.checkpoints.glob("*.zip"))) == 1
     stopping(replace(RUN, seed=4))
     assert len(list(trainer.checkpoints.glob("*.zip"))) == 1
     monkeypatch.undo()
@@ -99,7 +100,7 @@ def test_a_training_that_another_command_is_at_is_left_to_it(trainer):
     trainer.checkpoints.mkdir()
     with runs.FileLock(trainer.checkpoints / f".{RUN.name}.lock"):
         trainer(RUN)
-    assert not trainer.file.exists()
+    assert rows_of(trainer).empty
 
 
 def test_what_is_compiled_and_how_large_the_buffer_is_is_no_part_of_a_run(monkeypatch):
@@ -112,7 +113,7 @@ def test_what_is_compiled_and_how_large_the_buffer_is_is_no_part_of_a_run(monkey
 
 
 def test_the_setting_of_lac_is_that_of_its_file():
-    run = replace(RUN, settings=runs.setting_of_lac())
+    run = replace(RUN, settings=runs.setting_of_lac(root=4))
     env = run.environments()
     model = run.model(env, compiled=False)
     assert env.num_envs == 4 and (model.gradient_steps, model.learning_starts, model.tau) == (2, 1000, 0.01)
@@ -126,7 +127,7 @@ def table(**columns):
 
 
 def test_tables_of_two_machines_are_one_and_the_first_row_of_a_training_stays(tmp_path):
-    rows = Rows(tmp_path / "runs.csv")
+    rows = Rows(tmp_path)
     rows.add(table(seed=[1, 2], after_100_percent=[0.1 + 0.2, 2.0]))
     rows.add(table(seed=[2, 3], after_100_percent=[9.0, 3.0], machine="another"))
     together = rows.read()
@@ -134,7 +135,7 @@ def test_tables_of_two_machines_are_one_and_the_first_row_of_a_training_stays(tm
     rows.add(table(seed=[1], package="sb3_lac 0.7.0", after_100_percent=[7.0]))
     wanted = [Run("T", "lac", "sb3_lac:LAC", seed, 10) for seed in (3, 1, 4)]
     assert rows.of(wanted)["after_100_percent"].tolist() == [3.0, 7.0]
-    assert Rows(tmp_path / "none.csv").of(wanted).empty
+    assert Rows(tmp_path / "none").of(wanted).empty
 
 
 @pytest.mark.attacks

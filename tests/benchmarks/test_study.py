@@ -180,6 +180,20 @@ def test_files_say_what_made_them(tmp_path, capsys):
     assert (tmp_path / "example.md").read_text() in capsys.readouterr().out
 
 
+def test_a_large_table_is_packed_with_equal_bytes_for_equal_text_and_takes_the_place_of_the_plain_one(tmp_path):
+    tables = [pd.DataFrame({"value": np.arange(float(rows))}) for rows in (3, 30_000)]
+    for table in tables:
+        study.write_csv(tmp_path, "example", table.to_csv(index=False))
+        pd.testing.assert_frame_equal(study.read_tables(tmp_path)["example"], table)
+    (file,) = tmp_path.iterdir()
+    assert file.name == "example.csv.gz" and file == study.table_file(tmp_path, "example")
+    packed = file.read_bytes()
+    study.write_csv(tmp_path, "example", tables[1].to_csv(index=False))
+    assert file.read_bytes() == packed and packed[4:8] == bytes(4)  # no time of writing
+    study.write_csv(tmp_path, "example", tables[0].to_csv(index=False))
+    assert [path.name for path in tmp_path.iterdir()] == ["example.csv"]
+
+
 def test_numbers_read_well():
     values = [0.123, 1.26, 9.96, 99.4, 99.6, 12345.6, -0.00123, float("nan"), float("inf")]
     assert [digits(value) for value in values] == ["0.12", "1.3", "10", "99", "100", "12346", "-0.0012", "-", "never"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ from battery_env.electrochemistry.cell import (
 from battery_env.electrochemistry.equilibrium import on_unit_range, with_equilibrium
 from battery_env.electrochemistry.kernels import BLOCK
 from battery_env.electrochemistry.model_error import independent_errors
-from battery_env.parameters import PARAMETER_NAMES, columns_of
+from battery_env.parameters import PARAMETER_NAMES
 from battery_env.tasks.voltage.readings import (
     AT_REST,
     BLOCK_SIZE,
@@ -83,7 +83,7 @@ class FitResult(NamedTuple):
     """The fit of each cell of a batch."""
 
     estimate: FloatArray  # (q_mobile, r_o) after the step, C and ohm, shape (cells, 2)
-    sd: FloatArray  # standard deviations under the priors, 0 for a parameter that is known, same shape
+    sd: FloatArray  # standard deviations under the priors, same shape
     sd_flat_prior: FloatArray  # standard deviations without prior knowledge of the parameters, same shape
     constants: FloatArray  # as of NuisanceFit, shape (cells, 4) or (cells, 12)
     offset_V: FloatArray  # of the voltage sensor, V, shape (cells,)
@@ -95,27 +95,24 @@ class FitPrior:
     """The normal prior of the unknowns, each in a unit of its own."""
 
     mean: FloatArray  # of all unknowns, shape (n,)
-    units: FloatArray  # shape (n,); 0 for a parameter that is known
+    units: FloatArray  # shape (n,); 0 for an offset that is known
     precision: FloatArray  # the inverse of the covariance, in these units, shape (n, n)
     flat_precision: FloatArray  # ``precision`` without prior knowledge of the parameters, nor of correlations with them
     observation_scale: FloatArray  # scales of the constants in an observation, shape (n - 3,)
     path: AgingPath | None = None  # with a path the means of the parameters are those of their logarithms
 
     @classmethod
-    def of_ranges(
-        cls, parameters: Sequence[str], ranges: Mapping[str, tuple[float, float]], offset_V: float, nuisance: float
-    ) -> FitPrior:
+    def of_ranges(cls, ranges: Mapping[str, tuple[float, float]], offset_V: float, nuisance: float) -> FitPrior:
         """
-        Make a prior of independent unknowns: ``parameters`` have the mean and the standard deviation of their ranges, C and
-        ohm, and constants the relative standard deviation ``nuisance``.
+        Make a prior of independent unknowns: parameters have the mean and the standard deviation of their ranges, C and ohm,
+        and constants the relative standard deviation ``nuisance``.
         """
         limits = np.array(list(ranges.values()))
-        is_unknown = [name in parameters for name in ranges]
         constants = np.full(len(UNCERTAIN_CONSTANTS), np.sqrt(np.log1p(nuisance**2)))
-        uniform = np.append(np.ptp(limits, axis=1) * is_unknown, 2.0 * offset_V) / np.sqrt(12.0)
+        uniform = np.append(np.ptp(limits, axis=1), 2.0 * offset_V) / np.sqrt(12.0)
         mean = np.concatenate([limits.mean(axis=1), np.zeros(1 + len(constants))])
         flat_precision = np.eye(len(mean))
-        flat_precision[[_Q, _R], [_Q, _R]] = np.where(is_unknown, _FLAT_PRECISION, 1.0)
+        flat_precision[[_Q, _R], [_Q, _R]] = _FLAT_PRECISION
         units = np.concatenate([uniform, constants])
         return cls(mean, units, np.eye(len(mean)), flat_precision, np.full(len(constants), nuisance))
 
@@ -157,11 +154,8 @@ class NuisanceFit:
         voltage, V, shape (cells, 4) or (cells, 12)
     """
 
-    def __init__(
-        self, cells: int, model: NDArray[np.void], cell: CellParameters, parameters: Sequence[str], prior: FitPrior
-    ) -> None:
-        self.prior, unknowns = prior, len(prior.mean)
-        self._model, self._columns = model, columns_of(parameters)
+    def __init__(self, cells: int, model: NDArray[np.void], cell: CellParameters, prior: FitPrior) -> None:
+        self.prior, self._model, unknowns = prior, model, len(prior.mean)
         self._sd = np.sqrt(np.diag(np.linalg.inv(prior.precision))) * prior.units
         error = (0.0, 0.0) if prior.path is None else (prior.path.mismatch_V, prior.path.errors_per_C)
         means, units = np.tile(prior.mean, (cells, 1)), np.tile(prior.units, (cells, 1))
@@ -170,7 +164,7 @@ class NuisanceFit:
         self.constants = np.tile(self._first, (cells, 1))
         self._solution = np.zeros((cells, solution_size(unknowns)))
         self._equilibrium = _equilibrium_terms(cell, unknowns - _EQUILIBRIUM)
-        self.observation_size = 2 * len(self._columns) + 2 + unknowns - _KN
+        self.observation_size = 2 * len(PARAMETER_NAMES) + 2 + unknowns - _KN
 
     def step(self, rows: IntArray, count: IntArray, estimate: FloatArray, measurements: FloatArray) -> None:
         """Take one step for some cells; the arguments are those of :func:`nuisance_step`."""
@@ -210,7 +204,7 @@ class NuisanceFit:
     def observation_parts(self, largest_step: FloatArray, width: FloatArray) -> list[FloatArray]:
         """Return the fit's columns of the observation."""
         n = len(self.prior.mean)
-        step, sd = (self._solution[:, first : first + 2][:, self._columns] for first in (0, n))
+        step, sd = (self._solution[:, first : first + 2] for first in (0, n))
         return [
             np.clip(np.sign(step) * np.sqrt(np.abs(step) / largest_step), -1.0, 1.0),
             np.log(sd / (_SD_SCALE * width)),

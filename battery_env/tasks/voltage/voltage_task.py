@@ -15,7 +15,7 @@ from battery_env.arrays import FloatArray, IntArray
 from battery_env.checks import check_not_negative
 from battery_env.electrochemistry import CellParameters, check_cell
 from battery_env.electrochemistry.aging_path import AgingPath
-from battery_env.parameters import PARAMETER_NAMES, check_parameters, columns_of
+from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
 from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
@@ -64,32 +64,29 @@ def _readings_of_a_dataset(
 
 class VoltageTask(CalibrationTask):
     """
-    Estimate ``parameters`` from voltage and current, in ``cells`` episodes side by side.
+    Estimate ``q_mobile`` and ``r_o`` from voltage and current, in ``cells`` episodes side by side.
 
     An action moves the estimate by ``sign(a) * a**2`` times ``LARGEST_STEPS``: far where the misfit is large, finely near the
     optimum. Then new readings arrive, and the cost grows with the misfit to all data so far at the new estimate: the root mean
     square of the mean residuals of equal stretches of the data, without the likely offset of the sensor. A mean residual has
     less noise than a single reading. The misfit needs no true parameter, so that a task can use recorded discharges too. For
-    simulated discharges the cost may be the error of the model's hidden state instead, as in the paper.
-
-    A parameter that is not estimated has its true value in a simulated discharge, and the new cell's value in a recorded one.
-    The page of ``BatteryVoltageJoint-v0`` explains the options.
+    simulated discharges the cost may be the error of the model's hidden state instead, as in the paper. The page of
+    ``BatteryVoltageJoint-v0`` explains the options.
 
     :ivar readings: the readings of the discharges
     :ivar sensors: their sensors
     :ivar path: the prior of the fit in the observation; ``None``: no path
     :param cells: size of the batch
-    :param parameters: the parameters to estimate
     :raises ValueError: for values out of range
     """
 
     is_averaged = False
+    parameters = PARAMETER_NAMES
 
     def __init__(
         self,
         cells: int,
         *,
-        parameters: Sequence[str] = PARAMETER_NAMES,
         episode_steps: int = 8,
         reading_s: float | tuple[float, float] = 10.0,
         new_readings: tuple[int, int] = (0, 29),
@@ -106,7 +103,6 @@ class VoltageTask(CalibrationTask):
         dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **sensors: Any,
     ) -> None:
-        self.parameters = check_parameters(parameters)
         check_counts(episode_steps=episode_steps)
         check_not_negative(process_noise_V=process_noise_V, nuisance=nuisance)
         if not 0 <= new_readings[0] <= new_readings[1]:
@@ -117,11 +113,8 @@ class VoltageTask(CalibrationTask):
             raise ValueError(f"cost must be one of {get_args(Cost)}, got {cost!r}")
         if path is not None:
             path = path if isinstance(path, AgingPath) else AgingPath.from_json(path)
-            if nuisance > 0.0 or mismatch > 0.0 or len(self.parameters) < len(PARAMETER_NAMES):
-                raise ValueError(
-                    "path says how far constants are off, along with both parameters: leave nuisance and mismatch out, and "
-                    "take a task that looks for both"
-                )
+            if nuisance > 0.0 or mismatch > 0.0:
+                raise ValueError("path says how far constants are off: leave nuisance and mismatch out")
         choices = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
         self._open(dataset, reading_s, cell, path, choices)
         self.cells, self.new_readings, self.episode_steps = cells, new_readings, episode_steps
@@ -140,11 +133,11 @@ class VoltageTask(CalibrationTask):
         self.path, self._fit = path, None
         if nuisance > 0.0 or path is not None:
             prior = (
-                FitPrior.of_ranges(self.parameters, ESTIMATE_RANGES, self.sensors.offset_V, nuisance)
+                FitPrior.of_ranges(ESTIMATE_RANGES, self.sensors.offset_V, nuisance)
                 if path is None
                 else FitPrior.along(path, self.sensors.offset_V)
             )
-            self._fit = NuisanceFit(cells, self.readings.model, self.readings.cell, self.parameters, prior)
+            self._fit = NuisanceFit(cells, self.readings.model, self.readings.cell, prior)
             self.observation_size += self._fit.observation_size
         self._allocate()
 
@@ -180,11 +173,9 @@ class VoltageTask(CalibrationTask):
     def _set_scales(self) -> None:
         """Set the ranges of actions, and the first estimates."""
         cell, readings = self.readings.cell, self.readings
-        self._columns = columns_of(self.parameters)
         self._low, self._high = np.array([ESTIMATE_RANGES[name] for name in self.parameters]).T
         self._step = np.array([LARGEST_STEPS[name] for name in self.parameters])
-        self._new_cell: FloatArray = np.array([cell.q_mobile, cell.r_o])
-        self._new_cell[self._columns] = np.clip(self._new_cell[self._columns], self._low, self._high)
+        self._new_cell: FloatArray = np.clip([cell.q_mobile, cell.r_o], self._low, self._high)
         # the true parameters of the discharges, or the new cell's if they are unknown
         true = np.column_stack([readings.q_mobile, readings.r_o])
         self._reference = np.where(np.isnan(true), self._new_cell, true)
@@ -314,12 +305,9 @@ class VoltageTask(CalibrationTask):
         self._last_step[row] = self.episode_steps
 
     def _first_estimate(self, discharge: int, generator: np.random.Generator | None) -> FloatArray:
-        estimate = self._reference[discharge].copy()
         if self.first_estimate == "random" and generator is not None:
-            estimate[self._columns] = self._low + (self._high - self._low) * generator.random(len(self._low))
-        elif self.first_estimate != "true":
-            estimate[self._columns] = self._new_cell[self._columns]
-        return estimate
+            return np.asarray(self._low + (self._high - self._low) * generator.random(len(self._low)))
+        return (self._reference[discharge] if self.first_estimate == "true" else self._new_cell).copy()
 
     def _measure(self, row: int, discharge: int, generator: np.random.Generator) -> None:
         """Add the noise of the cell, and the errors of the sensors, to the measurements of one discharge."""
@@ -381,7 +369,7 @@ class VoltageTask(CalibrationTask):
         ]
 
     def _scaled(self, estimate: FloatArray) -> FloatArray:
-        return np.asarray((2.0 * estimate[:, self._columns] - self._low - self._high) / (self._high - self._low))
+        return np.asarray((2.0 * estimate - self._low - self._high) / (self._high - self._low))
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """Move the estimates, let new readings arrive, and compare all data so far with the model."""
@@ -389,8 +377,8 @@ class VoltageTask(CalibrationTask):
         if self._fit is not None and self.path is not None:
             estimate = self._fit.estimate_at(self._estimate, FURTHEST_SD * step)
         else:
-            estimate = self._estimate[:, self._columns] + np.sign(step) * step**2 * self._step
-        self._estimate[:, self._columns] = np.clip(estimate, self._low, self._high)
+            estimate = self._estimate + np.sign(step) * step**2 * self._step
+        self._estimate[:] = np.clip(estimate, self._low, self._high)
         self._add_readings()
         self._compare()
         error = self._state_error() / _STATE_COST_SCALE if self._cost == "state" else self._misfit_V / _COST_SCALE_V
