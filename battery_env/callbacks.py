@@ -191,10 +191,7 @@ class CalibrationCallback(EventCallback):
                 )
 
     def _summarize(self, trajectories: pd.DataFrame) -> dict[str, float]:
-        """
-        Return mean and worst value of each metric. A trajectory without a result (NaN) makes both NaN, and such a model is
-        never the best.
-        """
+        """Return mean and worst value of each metric, NaN if a trajectory has no result: then the model is never the best."""
         missing = [column for column in self.metrics if column not in trajectories.columns]
         if missing:
             raise ValueError(

@@ -23,7 +23,7 @@ from battery_env.electrochemistry.kernels import (
     step_of_block,
     voltage_batch,
 )
-from battery_env.electrochemistry.model_error import correlation_share
+from battery_env.electrochemistry.model_error import CORRELATION_SHARE
 from battery_env.electrochemistry.simulation import state_of_charge
 
 #: Probabilities of the quantiles that a forecast states: nine of ten outcomes lie between the outer two.
@@ -132,9 +132,7 @@ def simulate_to_cut_off(
         rows = np.arange(-first_step % stride, _CHUNK_STEPS, stride) if stride else np.arange(0)
         voltage_V, active_voltage_V = (np.full((n, len(rows)), cut_off_V) for n in (count, len(active)))
         active_progress, active_state = progress.take(active, axis=1), state[active]
-        run = _Run(
-            dt_s, power, model.thermal, float(cut_off_V), surplus_share, correlation_share("forecast"), first_step, stride
-        )
+        run = _Run(dt_s, power, model.thermal, float(cut_off_V), surplus_share, first_step, stride)
         overcharge_step = _advance(load, active_progress, run, model.cell.packed, active_state, active_voltage_V)
         if overcharge_step >= 0:
             raise ValueError(
@@ -165,7 +163,7 @@ def simulate_current(cells: Cells, model: Model, current_A: FloatArray, n_voltag
     progress, voltage_V = _initial_progress(cells, np.full(count, np.inf)), np.full((count, n_voltages + 1), np.nan)
     # no cut-off and no limit of the charge: the current was measured
     packed, sample_voltage_V = model.cell.packed, np.full((count, n_voltages), np.nan)
-    run = _Run(model.dt_s, False, model.thermal, -np.inf, np.inf, correlation_share("forecast"), 0, 0)
+    run = _Run(model.dt_s, False, model.thermal, -np.inf, np.inf, 0, 0)
     _advance(current_A[None, :first_voltage], progress, run, packed, state, sample_voltage_V)
     _advance(current_A[None, first_voltage:], progress, run._replace(stride=1), packed, state, sample_voltage_V)
     end_voltage_V = np.empty(count)
@@ -182,7 +180,6 @@ class _Run(NamedTuple):
     thermal: bool
     cut_off_V: float
     surplus_share: float  # largest charge beyond full
-    correlation_share: float  # over which the error of the model drifts
     first_step: int
     stride: int  # steps between two voltages of the course; 0: no course
 
@@ -223,7 +220,7 @@ def _advance(
                 volts = block[VOLTAGE + j] + progress[_ERROR, n]
                 if progress[_DRIFT, n] != 0.0:
                     # the error at the last voltages stays, as an error of r_o would; only the further error drifts
-                    correlation = exp(-max(depth, 0.0) / run.correlation_share)
+                    correlation = exp(-max(depth, 0.0) / CORRELATION_SHARE)
                     volts += progress[_DRIFT, n] * sqrt(1.0 - correlation * correlation)
                 step = first_step + k
                 if step <= progress[_LAST_STEP, n]:

@@ -251,11 +251,6 @@ def cell_step(
     x[m, QNB], x[m, QNS], x[m, QPB], x[m, QPS] = y[4], y[5], y[6], y[7]
 
 
-@inlined
-def cell_current(load: float, power: bool, voltage: float, extended: bool) -> float:
-    return _current(load, voltage, extended) if power else load
-
-
 @compiled
 def fill_block(
     block: FloatArray,
@@ -448,6 +443,6 @@ def roll_out(
         voltage[k] = cell_voltage(state, k, q, False, packed)
         if not voltage[k] >= cut_off:
             return k
-        current[k] = cell_current(load[k], power, voltage[k], False)
+        current[k] = _current(load[k], voltage[k], False) if power else load[k]
         cell_step(state, k, k + 1, current[k], q, r_o, dt, thermal, False, packed.constants)
     return int(load.shape[0])

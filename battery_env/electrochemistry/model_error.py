@@ -15,14 +15,11 @@ UNFITTED_ERROR_RATIO = 2.0
 #: - ``fit``: the residuals of a fit of the constants drift faster
 #: - ``path``: the error of a cell at its place along an aging path drifts faster too. Chosen on B0005 along the path of B0006
 ERRORS_PER_DISCHARGE: Mapping[str, float] = {"forecast": 1.0 / 0.15, "fit": 49.0, "path": 100.0}
+#: Correlation length of the model error in a forecast, as a share of ``q_mobile``.
+CORRELATION_SHARE = 1.0 / ERRORS_PER_DISCHARGE["forecast"]
 
 
 @compiled
 def independent_errors(charge_C: float, errors_per_C: float) -> float:
     """Return the number of independent model errors in a charge."""
     return 1.0 + errors_per_C * charge_C
-
-
-def correlation_share(purpose: str) -> float:
-    """Return the correlation length of the model error, as a share of ``q_mobile``."""
-    return 1.0 / ERRORS_PER_DISCHARGE[purpose]

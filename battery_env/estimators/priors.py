@@ -10,7 +10,7 @@ import numpy as np
 
 from battery_env.electrochemistry.aging_path import PATH_DISTANCE_LIMIT_SD, PATH_NAMES, AgingPath
 from battery_env.electrochemistry.cell import CellParameters
-from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO, correlation_share, independent_errors
+from battery_env.electrochemistry.model_error import CORRELATION_SHARE, UNFITTED_ERROR_RATIO, independent_errors
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate
 from battery_env.estimators.diagnosis.evidence import dropouts_of
@@ -61,7 +61,7 @@ class CellPrior:
         cell, drift_V = self.cell, UNFITTED_ERROR_RATIO * self.mismatch_V
         if drift_V and noise_V and self.starts_at_rest:
             drift_V = hypot(drift_V, sqrt(self._beyond_V2(first_V, noise_V)))
-        correlation_C = correlation_share("forecast") * q_mobile
+        correlation_C = CORRELATION_SHARE * q_mobile
         dropouts_s = tuple((each.begin_s, each.end_s) for each in dropouts_of(record, cell))
         return ErrorModel(drift_V, noise_V or 1.0, cell.r_o, cell.to, correlation_C, history.load_on_C, dropouts_s)
 

@@ -192,36 +192,29 @@ class Discharge:
         return [int(end) for end in ends if end <= last]
 
     def _ends_at(self, cut_off_V: float, last: int) -> bool:
-        """
-        Whether the last sample of a load is no farther above the cut-off than the voltage falls over the interval before: a
-        tester need not write the reading that stops it, and may write the row of the end just after a regular row.
-        """
+        """Whether the last voltage is within its last fall of the cut-off: testers may omit the reading that stops them."""
         first, _ = self.load
         interval_s = float(np.median(np.diff(self.time_s[first : last + 1]))) if last > first else 0.0
+        # the row of the end may come just after a regular row
         previous = max(int(np.searchsorted(self.time_s, self.time_s[last] - 0.5 * interval_s)) - 1, 0)
         is_steady = abs(self.current_A[last] - self.current_A[previous]) <= SWITCH_SHARE * self.current_A.max()
         fall_V = self.voltage_V[previous] - self.voltage_V[last]
         return bool(is_steady and fall_V > 0.0 and self.voltage_V[last] - cut_off_V <= fall_V)
 
     def _refuse_dip(self, dip_row: int, recovery_row: int, cut_off_V: float) -> None:
-        """
-        Refuse a voltage that falls below the cut-off in one step and returns in another, to no more than before, if the load
-        explains neither step: an ohmic drop takes at most the whole voltage above the cut-off at the largest current.
-        """
+        """Refuse a voltage that falls below the cut-off in one step and returns in another, if the load explains neither."""
         voltage_V, current_A = self.voltage_V, self.current_A
+        # an ohmic drop takes at most the whole voltage above the cut-off at the largest current
         largest_A = current_A.max()
         largest_ohm = max(float(voltage_V.max()) - cut_off_V, 0.0) / largest_A
-        if (
-            recovery_row - dip_row > _MOST_DIP_SAMPLES
-            and np.ptp(current_A[dip_row - 1 : recovery_row + 1]) > SWITCH_SHARE * largest_A
-        ):
+        changed_A = np.ptp(current_A[dip_row - 1 : recovery_row + 1])
+        if recovery_row - dip_row > _MOST_DIP_SAMPLES and changed_A > SWITCH_SHARE * largest_A:
             return
 
         def unexplained_V(high_row: int, low_row: int) -> float:
             # the tester may log voltage and current one sample apart
-            explained_V = largest_ohm * max(
-                float(current_A[max(low_row - 1, 0) : low_row + 1].max() - current_A[high_row]), 0.0
-            )
+            step_A = float(current_A[max(low_row - 1, 0) : low_row + 1].max() - current_A[high_row])
+            explained_V = largest_ohm * max(step_A, 0.0)
             return float(voltage_V[high_row] - voltage_V[low_row]) - explained_V
 
         falls_V, returns_V = unexplained_V(dip_row - 1, dip_row), unexplained_V(recovery_row, recovery_row - 1)

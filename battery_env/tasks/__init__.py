@@ -1,1 +1,1 @@
-"""Calibration as tasks of Gymnasium: what is asked of a task, and its environments for one cell and for many."""
+"""Calibration as tasks of Gymnasium: the tasks, and their environments for one cell and for many."""

@@ -15,7 +15,7 @@ import pytest
 import battery_env
 from battery_env import Calibration, Discharge, PolicyEstimator, Settings, load_nasa_discharges
 from battery_env.electrochemistry import NEW_CELL, CellParameters, Trajectory, initial_state, simulate
-from battery_env.electrochemistry.model_error import correlation_share
+from battery_env.electrochemistry.model_error import CORRELATION_SHARE
 from battery_env.estimates.findings import Reason
 from battery_env.estimators.cell_fit import read_cell
 from battery_env.lab.calibrate import calibrate as calibrated
@@ -185,7 +185,7 @@ def test_the_end_is_as_unsure_as_the_voltage_at_the_cut_off():
     settings = Settings(cut_off_V=3.5, prior_q_mobile_C=(6000.0, 20.0))
     row = calibrated(record, settings).row()
     # the voltage measured pins the error down, until more charge is drawn
-    left = np.exp(-2.0 * row["remaining_s"] / 6000.0 / correlation_share("forecast"))
+    left = np.exp(-2.0 * row["remaining_s"] / 6000.0 / CORRELATION_SHARE)
     off_V = 0.05 * np.sqrt(1.0 - left**2)
     early_s, late_s = np.interp([-3.5 - off_V, -3.5 + off_V], -true.voltage_V, true.time_s)
     expected_s = np.hypot(row["sd_q_mobile_C"] / 2.0, 0.5 * (late_s - early_s))

@@ -48,25 +48,20 @@ def with_signed_current(rows: pd.DataFrame, header: TableHeader, is_negative: bo
 
 
 def _jumps(rows: pd.DataFrame) -> float:
-    """
-    Return the sign of the current by the jumps of the voltage at its switches, or without switches by the fall of the voltage,
-    -1 to 1. Rows next to a switch may mix both sides; a voltage that the tester holds does not jump.
-    """
+    """Return the sign of the current, -1 to 1, by jumps of the voltage at switches, or without switches by its fall."""
     voltage_V, current_A = rows["voltage"].to_numpy(), rows["current"].to_numpy()
     n = switches(current_A)
     if not len(n):
         return float(np.sign(current_A.sum()) * (voltage_V[0] - voltage_V[-1]) / max(np.ptp(voltage_V), _LEAST_V))
     jump_V = np.diff(voltage_V)[n]
+    # rows next to a switch may mix both sides
     wide_V = voltage_V[np.minimum(n + 2, len(rows) - 1)] - voltage_V[np.maximum(n - 1, 0)]
     product = np.diff(current_A)[n] * np.where(np.abs(wide_V) > np.abs(jump_V), wide_V, jump_V)
     return -float(product.sum() / max(np.abs(product).sum(), _LEAST_V * SWITCH_SHARE * np.abs(current_A).max()))
 
 
 def _refuse_unsigned(rows: pd.DataFrame) -> None:
-    """
-    Refuse a current of one sign under which the voltage in places rises above that of the rest before, and in places falls.
-    After a reduced load the voltage may recover.
-    """
+    """Refuse a current of one sign if the voltage rises in places, other than after a reduced load, and falls in others."""
     voltage_V, size_A = rows["voltage"].to_numpy(), rows["current"].abs().to_numpy()
     begin = np.append(0, switches(size_A) + 1)
     end = np.append(begin[1:], len(rows)) - 1

@@ -157,9 +157,9 @@ class NuisanceFit:
     def __init__(self, cells: int, model: NDArray[np.void], cell: CellParameters, prior: FitPrior) -> None:
         self.prior, self._model, unknowns = prior, model, len(prior.mean)
         self._sd = np.sqrt(np.diag(np.linalg.inv(prior.precision))) * prior.units
-        error = (0.0, 0.0) if prior.path is None else (prior.path.mismatch_V, prior.path.errors_per_C)
+        mismatch_V, errors_per_C = (0.0, 0.0) if prior.path is None else (prior.path.mismatch_V, prior.path.errors_per_C)
         means, units = np.tile(prior.mean, (cells, 1)), np.tile(prior.units, (cells, 1))
-        self._prior_rows = StepPrior(means, units, prior.precision, prior.flat_precision, *error)
+        self._prior_rows = StepPrior(means, units, prior.precision, prior.flat_precision, mismatch_V, errors_per_C)
         self._first = np.zeros(unknowns - _KN) if prior.path is None else prior.mean[_KN:]
         self.constants = np.tile(self._first, (cells, 1))
         self._solution = np.zeros((cells, solution_size(unknowns)))
@@ -521,5 +521,5 @@ def nuisance_step(
         values[_KN:] = constants[n]
         errors = independent_errors(max(drawn_C, 0.0), prior.errors_per_C)
         least_noise_V = np.sqrt(_MIN_NOISE_V**2 + prior.mismatch_V**2 * count[n] / errors)
-        cell_prior = prior.mean[n], prior.units[n], prior.precision, prior.flat_precision
-        _solve_under_priors(sums, values, count[n], least_noise_V, *cell_prior, solution[n])
+        mean, units, precision, flat_precision = prior.mean[n], prior.units[n], prior.precision, prior.flat_precision
+        _solve_under_priors(sums, values, count[n], least_noise_V, mean, units, precision, flat_precision, solution[n])
