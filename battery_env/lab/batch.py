@@ -338,12 +338,10 @@ class Results:
         # the numbers of discharges are unknown before their files are read
         stems = "|".join(map(re.escape, self._stems))
         voltages = re.compile(rf"(?:{stems})(?:_\d+)*{VOLTAGE}\.(?:csv|png)", flags=re.IGNORECASE)
-        voltage_files = [
-            path for path in sorted(self.folder.iterdir()) if self.with_voltages and voltages.fullmatch(path.name)
-        ]
+        files = [path for path in sorted(self.folder.iterdir()) if self.with_voltages and voltages.fullmatch(path.name)]
         if resumes:
-            return [str(path) for path in voltage_files if path.suffix.lower() == ".csv" and not is_result(path)]
-        return [str(path) for path in (self.folder / TABLE, self.folder / LIFE, *voltage_files) if path.exists()]
+            return [str(path) for path in files if path.suffix.lower() == ".csv" and not is_result(path)]
+        return [str(path) for path in (self.folder / TABLE, self.folder / LIFE, *files) if path.exists()]
 
     @property
     def done(self) -> list[Outcome]:
@@ -525,18 +523,15 @@ def _start_of(read: Attempt) -> str:
 
 def _places(source: Source, read: Attempt, used: set[str]) -> Iterator[tuple[_Place, Recording | None]]:
     """The discharges of a source with their recordings; or the error of an unreadable source, without a recording."""
-    if read.error:
-        error = read.error if printable(source.path) in read.error else f"{source.path}: {read.error}"
-        name = _unused(record_name(source.stem, source.cycle), used)
-        outcome = Outcome(name, source.path, source.cell, source.cycle, notes="; ".join(read.notes), error=error)
-        yield _Place(outcome, source, 0, 1, None), None
-        return
-    stamp, recordings = read.result
+    notes, error = "; ".join(read.notes), read.error
+    if error and printable(source.path) not in error:
+        error = f"{source.path}: {error}"
+    stamp, recordings = read.result or (None, [None])
     for number, recording in enumerate(recordings):
-        cycle = recording.meta.get("cycle")
+        meta = recording.meta if recording else {"cycle": source.cycle}
+        cycle, start_time = meta.get("cycle"), str(meta.get("start_time", ""))
         name = _unused(record_name(source.stem, cycle), used)
-        start = str(recording.meta.get("start_time", ""))
-        outcome = Outcome(name, source.path, source.cell, cycle, start, notes="; ".join(read.notes))
+        outcome = Outcome(name, source.path, source.cell, cycle, start_time, notes=notes, error=error)
         yield _Place(outcome, source, number, len(recordings), stamp), recording
 
 

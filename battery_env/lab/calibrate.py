@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from math import hypot, nan, sqrt
@@ -158,6 +159,7 @@ class Fit(NamedTuple):
     """The model, fitted to a discharge by :func:`estimate`."""
 
     estimate: Estimate
+    reported: Estimate  # the same, without numbers if the search has ended at a bound
     model: RecordModel
     voltage: VoltageForecast
     evidence: Evidence
@@ -174,70 +176,14 @@ class Fit(NamedTuple):
             )
 
 
-def calibrated(
-    discharge: Discharge,
-    settings: Settings,
-    load: LoadToCome | None = None,
-    samples: int = 1000,
-    end_is_asked: bool = False,
-    fixes_constants: bool = False,
-) -> Calibration:
-    """
-    Calibrate one discharge, and predict the end of one in progress.
-
-    :param load: after the record; ``None``: as so far
-    :param samples: number of samples of the forecast
-    :param end_is_asked: whether an end that cannot be predicted is an error instead of an unknown
-    :param fixes_constants: see :func:`estimate`
-    """
+def calibrated(discharge: Discharge, settings: Settings, samples: int = 1000) -> Calibration:
+    """Calibrate one discharge; if it is in progress, predict its end if possible, with so many samples."""
     loaded = cut(discharge, settings)
-    for note in loaded.notes:
-        warnings.warn(note, stacklevel=3)
-    if end_is_asked and _is_below_all_sizes(loaded):
-        raise ValueError(Reason.BELOW_ALL_SIZES.text)
-    fit, end = estimate(loaded, fixes_constants), None
-    for note in fit.notes:
-        warnings.warn(note, stacklevel=3)
-    sized = _of_its_size(fit.estimate, loaded)
-    if end_is_asked or (loaded.in_progress and np.isfinite(sized.q_mobile)):  # a cell of unknown size has no end
-        try:
-            end = predict(loaded, fit, load, samples)
-        except ValueError:
-            if end_is_asked:
-                raise
-    end_s, sd_end_s = (fit.voltage.eod_time_s, nan) if end is None else _middle(end.eod_time_s, fit.estimate)
-    return Calibration(
-        settings=settings,
-        cycle=discharge.meta.get("cycle"),
-        method=settings.method or "least-squares",
-        q_mobile_C=sized.q_mobile,
-        sd_q_mobile_C=sized.sd_q_mobile,
-        resistance_10s_ohm=sized.resistance_10s_ohm,
-        sd_resistance_10s_ohm=sized.sd_resistance_10s_ohm,
-        measured_resistance_10s_ohm=measured_resistance_ohm(loaded.part, loaded.part.starts_at_rest),
-        r_o_ohm=sized.r_o,
-        sd_r_o_ohm=sized.sd_r_o,
-        settled=sized.settled,
-        settled_q_mobile=sized.settled_q_mobile,
-        settled_resistance_10s=sized.settled_resistance_10s,
-        settled_r_o=sized.settled_r_o,
-        findings=sized.findings,
-        initial_soc=loaded.start.soc,
-        sd_initial_soc=loaded.start.sd_soc,
-        samples=len(loaded.part.time_s),
-        load_on_time_s=float(loaded.record.time_s[0]),
-        **_charge(loaded, fit, end),
-        voltage_rmse_V=_rmse_V(loaded, fit),
-        predicted_eod_time_s=end_s,
-        sd_predicted_eod_time_s=sd_end_s,
-        measured_eod_time_s=loaded.eod_time_s,
-        remaining_s=end_s - float(loaded.record.time_s[-1]) if loaded.in_progress else 0.0,
-        future_current_A=loaded.load.mean_A,
-        load_varied=loaded.load.is_varying,
-        record=loaded.record,
-        forecast=fit.voltage,
-        end=end,
-    )
+    fit, end = estimate(loaded), None
+    if loaded.in_progress and np.isfinite(fit.reported.q_mobile):  # a cell of unknown size has no end
+        with suppress(ValueError):
+            end = predict(loaded, fit, samples=samples)
+    return calibration_of(loaded, fit, end)
 
 
 def cut(discharge: Discharge, settings: Settings) -> LoadedPart:
@@ -255,7 +201,7 @@ def cut(discharge: Discharge, settings: Settings) -> LoadedPart:
     else:
         soc, sd_soc = check_initial_soc(settings.initial_soc)
         start = Start(soc, sd_soc)
-    return LoadedPart(
+    loaded = LoadedPart(
         settings=settings.expecting(mean_current_A(record)),
         discharge=discharge,
         part=part,
@@ -266,6 +212,8 @@ def cut(discharge: Discharge, settings: Settings) -> LoadedPart:
         start=start,
         load=expected_current(record.time_s, record.current_A),
     )
+    _warn(loaded.notes)
+    return loaded
 
 
 def estimate(loaded: LoadedPart, fixes_constants: bool = False) -> Fit:
@@ -300,11 +248,21 @@ def estimate(loaded: LoadedPart, fixes_constants: bool = False) -> Fit:
     voltage = model.forecast(record, result, cut_off_V, current_A)
     history, parameters = history_of(record, resolved.usual_start), (result.q_mobile, result.r_o)
     evidence = evidence_of(Samples.of(record), loaded.cell, start.soc, parameters, history, voltage.at_samples_V)
-    return Fit(result, model, voltage, evidence)
+    fit = Fit(result, _of_its_size(result, loaded), model, voltage, evidence)
+    _warn(fit.notes)
+    return fit
+
+
+def _warn(notes: Iterable[str]) -> None:
+    """Warn the caller of :func:`calibrate` or ``forecast_end``, which call the steps through one more function."""
+    for note in notes:
+        warnings.warn(note, stacklevel=5)
 
 
 def predict(loaded: LoadedPart, fit: Fit, load: LoadToCome | None = None, samples: int = 1000) -> Forecast:
     """Predict the end of a discharge from the end of its record on, under a load (``None``: as so far)."""
+    if _is_below_all_sizes(loaded):
+        raise ValueError(Reason.BELOW_ALL_SIZES.text)
     settings, cut_off_V, result = loaded.settings, loaded.settings.resolved.cut_off_V, fit.estimate
     if settings.prior_q_mobile_C is None and settings.fit is not None:
         result = result.within(*settings.fit.life_q_mobile_C)
@@ -331,6 +289,38 @@ def predict(loaded: LoadedPart, fit: Fit, load: LoadToCome | None = None, sample
         resistance_10s_ohm=end.resistance_10s_ohm / gains,
         nominal_Ah=end.nominal_Ah if has_health else nan,
         notes=(*end.notes, *_notes(loaded, fit, load_A)),
+    )
+
+
+def calibration_of(loaded: LoadedPart, fit: Fit, end: Forecast | None) -> Calibration:
+    """Return the results of the three steps as columns."""
+    result = fit.reported
+    end_s, sd_end_s = (fit.voltage.eod_time_s, nan) if end is None else _middle(end.eod_time_s, fit.estimate)
+    return Calibration(
+        settings=loaded.settings,
+        cycle=loaded.discharge.meta.get("cycle"),
+        method=loaded.settings.method or "least-squares",
+        q_mobile_C=result.q_mobile,
+        sd_q_mobile_C=result.sd_q_mobile,
+        measured_resistance_10s_ohm=measured_resistance_ohm(loaded.part, loaded.part.starts_at_rest),
+        r_o_ohm=result.r_o,
+        sd_r_o_ohm=result.sd_r_o,
+        **{name: value for name, value in vars(result).items() if name in Calibration.__annotations__},
+        initial_soc=loaded.start.soc,
+        sd_initial_soc=loaded.start.sd_soc,
+        samples=len(loaded.part.time_s),
+        load_on_time_s=float(loaded.record.time_s[0]),
+        **_charge(loaded, fit, end),
+        voltage_rmse_V=_rmse_V(loaded, fit),
+        predicted_eod_time_s=end_s,
+        sd_predicted_eod_time_s=sd_end_s,
+        measured_eod_time_s=loaded.eod_time_s,
+        remaining_s=end_s - float(loaded.record.time_s[-1]) if loaded.in_progress else 0.0,
+        future_current_A=loaded.load.mean_A,
+        load_varied=loaded.load.is_varying,
+        record=loaded.record,
+        forecast=fit.voltage,
+        end=end,
     )
 
 
@@ -426,7 +416,7 @@ def _of_its_size(result: Estimate, loaded: LoadedPart) -> Estimate:
     return replace(result, **unknown, findings=(Finding.of(Reason.BELOW_ALL_SIZES),) if is_small else result.findings)
 
 
-def _charge(loaded: LoadedPart, fit: Fit, end: Forecast | None) -> dict[str, float]:
+def _charge(loaded: LoadedPart, fit: Fit, end: Forecast | None) -> dict[str, Any]:
     """The columns of the charge drawn, and of the capacity from full: a full cell ends at the same charge left."""
     drawn_Ah, start, q_mobile = loaded.part.charge_C / 3600.0, loaded.start, fit.estimate.q_mobile
     capacity_Ah = drawn_Ah if start.soc == 1.0 and not loaded.in_progress else nan

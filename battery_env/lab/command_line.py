@@ -51,16 +51,16 @@ class _Assignments(argparse.Action):
     """Options of the form quantity=NAME,quantity=NAME, which may be repeated, with one value for each quantity."""
 
     def __call__(self, _parser: Any, namespace: argparse.Namespace, text: Any, _option: str | None = None) -> None:
-        assignments = dict(getattr(namespace, self.dest) or {})
+        values = dict(getattr(namespace, self.dest) or {})
         for name, equals, value in (assignment.partition("=") for assignment in _ASSIGNMENTS.split(text)):
             quantity, value = name.strip(), value.strip()
             if not (quantity and equals and value):
                 raise argparse.ArgumentError(self, f"expected quantity=NAME,quantity=NAME, got {text!r}")
-            if assignments.setdefault(quantity, value) != value:
+            if values.setdefault(quantity, value) != value:
                 raise argparse.ArgumentError(
-                    self, f"the {quantity} cannot be both {assignments[quantity]!r} and {value!r}: give one"
+                    self, f"the {quantity} cannot be both {values[quantity]!r} and {value!r}: give one"
                 )
-        setattr(namespace, self.dest, assignments)
+        setattr(namespace, self.dest, values)
 
 
 def _initial_soc(text: str) -> InitialSoc | Literal["rest"]:

@@ -231,9 +231,8 @@ def _numbers(calibration: Calibration) -> list[str]:
 
 def line_of(name: str, calibration: Calibration) -> str:
     """Return a calibration in one line."""
-    return f"{name:<18} " + "  ".join(
-        [*_numbers(calibration), f"{calibration.state}: {calibration.reason}" if calibration.findings else calibration.state]
-    )
+    verdict = f"{calibration.state}: {calibration.reason}" if calibration.findings else calibration.state
+    return f"{name:<18} " + "  ".join([*_numbers(calibration), verdict])
 
 
 def change_of(first: Calibration, last: Calibration) -> str:

@@ -14,7 +14,7 @@ from battery_env.checks import LoadUnit
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.estimates.findings import is_only_imprecise
 from battery_env.files import finite_or_none, replacing
-from battery_env.lab.calibrate import calibrated
+from battery_env.lab.calibrate import calibration_of, cut, estimate, predict
 from battery_env.lab.forecast import Forecast, decimals
 from battery_env.lab.life import Life, life_before
 from battery_env.lab.readers.columns import FileFormat
@@ -153,8 +153,9 @@ def calibrate_running(
         settings = replace(settings, prior_q_mobile_C=life.prior_for(discharge, load), usual_start=start)
     # constants without a stated uncertainty carry over from a life, or to another load
     carries_over = settings.prior_q_mobile_C is not None and (life is not None or load is not None)
-    fixes_constants = carries_over and not settings.cell_rates_sd
-    return calibrated(discharge, settings, load, samples, end_is_asked=True, fixes_constants=fixes_constants)
+    loaded = cut(discharge, settings)
+    fit = estimate(loaded, fixes_constants=carries_over and not settings.cell_rates_sd)
+    return calibration_of(loaded, fit, predict(loaded, fit, load, samples))
 
 
 def read_load(path: str | Path) -> Load:

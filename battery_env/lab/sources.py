@@ -205,9 +205,7 @@ def read_source(source: Source, file_format: FileFormat) -> list[Recording]:
         return recordings
     chosen = [recording for recording in recordings if recording.meta.get("cycle") == cycle]
     if not chosen:
-        numbers = sorted({recording.meta["cycle"] for recording in recordings if "cycle" in recording.meta})
-        contents = (
-            f"has discharges {path}:{numbers[0]} .. {path}:{numbers[-1]}" if numbers else "has one discharge, without a number"
-        )
-        raise ValueError(f"{path} {contents}, got {source.argument}")
+        cycles = sorted({recording.meta["cycle"] for recording in recordings if "cycle" in recording.meta})
+        text = f"has discharges {path}:{cycles[0]} .. {path}:{cycles[-1]}" if cycles else "has one discharge, without a number"
+        raise ValueError(f"{path} {text}, got {source.argument}")
     return chosen
