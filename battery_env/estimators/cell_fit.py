@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from math import exp, hypot, log, sqrt
+from math import exp, hypot, log, log1p, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ _GROWTH = 1.2
 # For the error to expect each of so many groups, from the youngest to the oldest, is left out of the fit once.
 _GROUPS = 3
 # How much the logarithm of q_mobile falls over a life.
-_LIFE = -log(1.0 - LIFE_LOSS)
+_LIFE = -log1p(-LIFE_LOSS)
 
 
 @dataclass(frozen=True)

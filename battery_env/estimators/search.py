@@ -28,8 +28,6 @@ MARGIN = 1e-6
 _LOG_LIMIT = 50.0
 # Logarithms of nuisance constants are held within this, unless they have bounds.
 _REACHED = dict.fromkeys(RATE_CONSTANTS, (-5.0, 5.0))
-# A resistance that the search takes below zero has no logarithm.
-_LEAST = 1e-6
 # About so far apart, in the logarithm of q_mobile, are cells of one size.
 _SIZE_WIDTH = 0.2
 _SCALES = {"q_mobile": 1.0, "r_o": 0.1}
@@ -45,8 +43,6 @@ _COARSE_POINTS = 100
 _STEP_SD = 0.5
 # So many of them at most.
 _STEPS = 100
-# How far the logarithm of a normal likelihood falls in a standard deviation.
-_FALL = 0.5
 
 
 @dataclass(frozen=True)
@@ -130,8 +126,9 @@ class JointPrior:
         """The residuals, and their derivatives by all unknowns."""
         logarithmic = [name in PARAMETER_NAMES for name in self.names]
         given = np.array([values[name] for name in self.names])
-        x = np.where(logarithmic, np.log(np.where(logarithmic, np.maximum(given, _LEAST), 1.0)), given)
-        slopes = np.where(logarithmic, 1.0 / np.where(logarithmic, np.maximum(given, _LEAST), 1.0), 1.0)
+        # a resistance that the search takes below zero has no logarithm
+        positive = np.where(logarithmic, np.maximum(given, MARGIN), 1.0)
+        x, slopes = np.where(logarithmic, np.log(positive), given), 1.0 / positive
         by_unknown = np.zeros((len(self.names), len(unknown)))
         columns = {name: n for n, name in enumerate(self.names)}
         for n, name in enumerate(unknown):
@@ -288,9 +285,9 @@ class Search:
 
     def spread(self, fit: Fit, priors: Sequence[AnyPrior], variance: float) -> float:
         """
-        How many times as wide as its curvature says the likelihood of ``q_mobile`` is, between the points where it has fallen
-        as a normal one does in a standard deviation; at least 1. It is adjusted for the other unknowns (Cox and Reid 1987),
-        which follow from point to point by a step of Gauss and Newton.
+        How many times as wide as its curvature says the likelihood of ``q_mobile`` is, between the points where its deviance,
+        minus twice its logarithm, has risen by one, as a normal one's does in a standard deviation; at least 1. It is adjusted
+        for the other unknowns (Cox and Reid 1987), which follow from point to point by a step of Gauss and Newton.
         """
         column = self.unknown.index("q_mobile")
         best_C = fit.values["q_mobile"]
@@ -304,28 +301,27 @@ class Search:
             residual, jacobian = self.weighed(values, priors)
             others = np.delete(jacobian, column, axis=1)
             change = np.linalg.lstsq(others, -residual, rcond=None)[0]
-            left = square(residual + others @ change) / variance + np.linalg.slogdet(others.T @ others)[1]
-            return -0.5 * left, values | {name: values[name] + float(each) for name, each in zip(names, change, strict=True)}
+            deviance = square(residual + others @ change) / variance + np.linalg.slogdet(others.T @ others)[1]
+            return deviance, values | {name: values[name] + float(each) for name, each in zip(names, change, strict=True)}
 
         best = adjusted(fit.values)
-        highest, ends_C = best[0], []
+        least, ends_C = best[0], []
         # upward a likelihood may be flat: steps grow with the distance to the least value, where that is more than a step
         near_C = min(least_C, best_C - _STEP_SD * sd_C)
         for side in (-1, 1):
-            (height, values), q_C = best, best_C
+            (deviance, values), q_C = best, best_C
             for way_C in _STEP_SD * sd_C * np.arange(1, _STEPS):
-                before, before_C = height, q_C
+                before, before_C = deviance, q_C
                 q_C = best_C - way_C if side < 0 else near_C + (best_C - near_C) * exp(way_C / (best_C - near_C))
                 bounds_C = self._bounds_at(values)["q_mobile"]
                 if _within(q_C, bounds_C) != q_C:
                     q_C = _within(q_C, bounds_C)
                     break
-                height, values = adjusted(values | {"q_mobile": q_C})
-                highest = max(highest, height)
-                if height < highest - _FALL:
-                    # of a normal likelihood the root of its fall is linear in the distance
-                    fallen = sqrt(highest - before), sqrt(highest - height)
-                    q_C = float(np.interp(sqrt(_FALL), fallen, (before_C, q_C)))
+                deviance, values = adjusted(values | {"q_mobile": q_C})
+                least = min(least, deviance)
+                if deviance > least + 1.0:
+                    # of a normal likelihood the root of its rise is linear in the distance
+                    q_C = float(np.interp(1.0, (sqrt(before - least), sqrt(deviance - least)), (before_C, q_C)))
                     break
             ends_C.append(q_C)
         return max((ends_C[1] - ends_C[0]) / (2.0 * sd_C), 1.0)
