@@ -91,8 +91,9 @@ class Confidence:
         for k, name in enumerate(PARAMETER_NAMES):
             diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
         values, sds = (dict(zip(PARAMETER_NAMES, each.tolist(), strict=True)) for each in (estimate, sd))
-        known = Assumptions(apart=dict(zip(PARAMETER_NAMES, apart.tolist(), strict=True)), is_along_path=path is not None)
-        verdict = diagnosis.verdict(values, sds, PARAMETER_NAMES, known=known)
+        distances = dict(zip(PARAMETER_NAMES, apart.tolist(), strict=True))
+        assumptions = Assumptions(distance_from_fit=distances, is_along_path=path is not None)
+        verdict = diagnosis.verdict(values, sds, PARAMETER_NAMES, assumptions=assumptions)
         # the same NaN always, so that equal estimates are equal
         sd_q_mobile, sd_r_o = (nan if isnan(sd) else sd for sd in np.hypot(self._sd_ratio * fitted.sd[n], hidden).tolist())
         constants = None if path is None else _by_name(fitted, n)
