@@ -55,7 +55,7 @@ from battery_env.records import (
 )
 from battery_env.records.model import RecordModel
 
-# Least noise that is estimated from residuals, V: the resolution of a voltmeter. No estimate of the bundled cells depends on it.
+# Least noise that is estimated from residuals, V: a voltmeter's resolution. No estimate of the bundled cells depends on it.
 _LEAST_NOISE_V = 1e-4
 # Step of the state of charge for a derivative. Twice as much changes standard deviations of the bundled cells by 0.1 %.
 _SOC_STEP = 1e-3
@@ -210,8 +210,9 @@ class LeastSquares(Estimator):
             cell, mismatch_V = cell or path.cell, mismatch_V or path.mismatch_V
         self.initial_soc = check_initial_soc(initial_soc)
         self.model = RecordModel(cell, thermal, dt_s, initial, self.initial_soc[0])
-        of_cell = self.model.cell, mismatch_V, initial is None
-        self.prior = CellPrior(*of_cell, sds, sd_ratio=1.0) if path is None else PathPrior.of(path, *of_cell)
+        self.prior = CellPrior(self.model.cell, mismatch_V, initial is None, sds, sd_ratio=1.0)
+        if path is not None:
+            self.prior = PathPrior.of(path, self.model.cell, mismatch_V, initial is None)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         if prior_q_mobile_C is not None:
             if "q_mobile" not in self.parameters:
