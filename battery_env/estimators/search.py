@@ -93,10 +93,9 @@ class Prior:
     mean: float
     weight: float  # per unit of the unknown, as residuals are weighed
 
-    def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """The residual, and its derivatives by all unknowns."""
-        row = np.array([[self.weight if name == self.name else 0.0 for name in unknown]])
-        return np.array([self.weight * (values[self.name] - self.mean)]), row
+    def residual(self, values: Mapping[str, float]) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """The residual, and its derivatives by unknown."""
+        return np.array([self.weight * (values[self.name] - self.mean)]), {self.name: np.array([self.weight])}
 
 
 @dataclass(frozen=True)
@@ -108,13 +107,12 @@ class SizePrior:
 
     usual_C: float
 
-    def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """The residual, and its derivatives by all unknowns."""
+    def residual(self, values: Mapping[str, float]) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """The residual, and its derivatives by unknown."""
         distance = log(values["q_mobile"] / self.usual_C) / _SIZE_WIDTH
         residual = copysign(sqrt(log1p(distance**2)), distance)
         slope = distance / (1.0 + distance**2) / residual if residual else 1.0
-        row = np.array([[slope / (_SIZE_WIDTH * values["q_mobile"]) if name == "q_mobile" else 0.0 for name in unknown]])
-        return np.array([residual]), row
+        return np.array([residual]), {"q_mobile": np.array([slope / (_SIZE_WIDTH * values["q_mobile"])])}
 
 
 @dataclass(frozen=True)
@@ -125,19 +123,14 @@ class JointPrior:
     mean: FloatArray
     rows: FloatArray  # of the residuals, by the unknowns
 
-    def residual(self, values: Mapping[str, float], unknown: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """The residuals, and their derivatives by all unknowns."""
+    def residual(self, values: Mapping[str, float]) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """The residuals, and their derivatives by unknown."""
         logarithmic = [name in PARAMETER_NAMES for name in self.names]
         given = np.array([values[name] for name in self.names])
         # a resistance that the search takes below zero has no logarithm
         positive = np.where(logarithmic, np.maximum(given, MARGIN), 1.0)
         x, slopes = np.where(logarithmic, np.log(positive), given), 1.0 / positive
-        by_unknown = np.zeros((len(self.names), len(unknown)))
-        columns = {name: n for n, name in enumerate(self.names)}
-        for n, name in enumerate(unknown):
-            if name in columns:
-                by_unknown[:, n] = self.rows[:, columns[name]] * slopes[columns[name]]
-        return self.rows @ (x - self.mean), by_unknown
+        return self.rows @ (x - self.mean), dict(zip(self.names, (self.rows * slopes).T, strict=True))
 
 
 AnyPrior = Prior | SizePrior | JointPrior
@@ -376,7 +369,8 @@ class Search:
         rows = self.error_at_samples.whitened(np.column_stack([residual_V, jacobian_V]))
         residual, jacobian = rows[:, 0], rows[:, 1:]
         for prior in priors:
-            of_prior, by_unknown = prior.residual(values, self.unknown)
+            of_prior, slopes = prior.residual(values)
+            by_unknown = np.column_stack([slopes.get(name, np.zeros(len(of_prior))) for name in self.unknown])
             residual, jacobian = np.append(residual, of_prior), np.vstack([jacobian, by_unknown])
         return residual, jacobian
 
@@ -459,13 +453,8 @@ class JointSearch:
         **how: Any,
     ) -> list[dict[str, float]]:
         """
-        Minimize the squares of the residuals.
-
-        :param starts: values of all unknowns of each record
-        :param free: the unknowns that may change, in the order of :attr:`Search.unknown`
-        :param limits: of these, as the search has them; ``None``: there are none
-        :param how: further arguments of scipy's ``least_squares``
-        :return: the values of each record
+        Minimize the squares of the residuals by scipy over the free unknowns, in the order of :attr:`Search.unknown`, within
+        limits of the points of the search; from values of each record to values of each record.
         """
         first, count = self.searches[0], len(self.searches)
         own = sum(name in first.parameters for name in free)

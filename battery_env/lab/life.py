@@ -22,7 +22,6 @@ from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.electrochemistry.model_error import WHOLE_ERROR
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
-from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import Alternative, LeastSquares, RecordFit
@@ -259,13 +258,13 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
     held, unsure = copy(held), copy(unsure)
     held.usual_start = unsure.usual_start = usual_start or held.usual_start
     rows = []
-    last_valid: tuple[Estimate, RecordFit] | None = None
+    last_fit: RecordFit | None = None
     for position, discharge in enumerate(discharges):
         row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
         try:
-            columns, of_its_own = _row_of(discharge, cut_off_V, held, unsure)
-            rows.append(row | columns)
-            last_valid = of_its_own if columns["valid"] else last_valid
+            fit = unsure.fit(discharge.loaded_part(cut_off_V))
+            rows.append(row | _row_of(discharge, cut_off_V, held, unsure, fit))
+            last_fit = fit if rows[-1]["valid"] else last_fit
         except ValueError as error:  # of one that cannot be used
             rows.append(
                 row
@@ -278,10 +277,10 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, held: LeastSquares
             )
     texts = [{"reason": reason_of(row["findings"])} for row in rows]
     life = life_of(pd.DataFrame([row | text for row, text in zip(rows, texts, strict=True)], columns=_COLUMNS))
-    assert last_valid is not None  # a life without a valid discharge is refused
-    estimate, fit = last_valid
+    assert last_fit is not None  # a life without a valid discharge is refused
+    estimate, alternatives = unsure.estimate_of(last_fit), last_fit.alternatives()
     sd_share = estimate.sd_q_mobile / estimate.q_mobile
-    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=fit.alternatives())
+    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=alternatives)
 
 
 def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> DischargeStart | None:
@@ -297,14 +296,10 @@ def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> Discharge
 
 
 def _row_of(
-    discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: LeastSquares
-) -> tuple[dict[str, Any], tuple[Estimate, RecordFit]]:
-    """
-    The row of one discharge in the table; and its estimate and fit with constants that are not held. The resistance in the row
-    is of this estimate, because constants age, too.
-    """
+    discharge: Discharge, cut_off_V: float, held: LeastSquares, unsure: LeastSquares, fit: RecordFit
+) -> dict[str, Any]:
+    """What one discharge says alone; of its resistance by a fit with constants that are not held, as they age, too."""
     record = discharge.loaded_part(cut_off_V)
-    fit = unsure.fit(record)
     of_its_own = unsure.estimate_of(fit)
     estimate = of_its_own if held.prior.nuisance == unsure.prior.nuisance else held.estimate(record)
     end_s = held.model.forecast(record, estimate, cut_off_V).eod_time_s
@@ -312,7 +307,7 @@ def _row_of(
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
     # what leaves the resistance in doubt is no doubt of q_mobile
     of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]
-    row = {
+    return {
         "q_mobile_C": estimate.q_mobile,
         "sd_q_mobile_C": estimate.sd_q_mobile,
         "resistance_10s_ohm": of_its_own.resistance_10s_ohm,
@@ -327,7 +322,6 @@ def _row_of(
         "mean_current_A": mean_current_A(record),
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
     }
-    return row, (of_its_own, fit)
 
 
 def life_of(table: pd.DataFrame) -> Life:
