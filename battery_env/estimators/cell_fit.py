@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from math import exp, hypot, log, sqrt
+from math import exp, hypot, log, log1p, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ _GROWTH = 1.2
 # For the error to expect each of so many groups, from the youngest to the oldest, is left out of the fit once.
 _GROUPS = 3
 # How much the logarithm of q_mobile falls over a life.
-_LIFE = -log(1.0 - LIFE_LOSS)
+_LIFE = -log1p(-LIFE_LOSS)
 
 
 @dataclass(frozen=True)
@@ -162,8 +162,8 @@ class CellFit:
     @property
     def currents_A(self) -> tuple[float, float] | None:
         """The lowest and the highest mean current of the discharges, A; ``None`` if the file of the fit does not tell."""
-        found = [each.current_A for each in self.discharges if each.current_A is not None]
-        return (min(found), max(found)) if found else None
+        currents_A = [each.current_A for each in self.discharges if each.current_A is not None]
+        return (min(currents_A), max(currents_A)) if currents_A else None
 
     @property
     def doubt(self) -> str:
@@ -182,7 +182,7 @@ class CellFit:
 
     def _doubt_of_ages(self) -> str:
         q_C = np.array([discharge.q_mobile for discharge in self.discharges])
-        if unseen_of_life(q_C) <= 0.5 * _LIFE:
+        if uncovered_life(q_C) <= 0.5 * _LIFE:
             return ""
         return (
             "The discharges that were fitted show one age, or less than half of a cell's life: q_mobile is "
@@ -212,7 +212,7 @@ class CellFit:
 
         :param arguments: others of :class:`~battery_env.LeastSquares`; they replace these
         """
-        own = {
+        of_fit = {
             "cell": self.cell,
             "thermal": self.thermal,
             "mismatch_V": self.mismatch_V,
@@ -220,7 +220,7 @@ class CellFit:
             "nuisance": self.rates_sd,
             "usual_start": self.usual_start,
         }
-        return LeastSquares(**{**own, **arguments})
+        return LeastSquares(**{**of_fit, **arguments})
 
     @property
     def rates_sd(self) -> dict[str, float]:
@@ -242,14 +242,14 @@ class CellFit:
         life, and a fifth beyond both ends, as another cell of the kind may hold more or less.
         """
         q_C = np.array([discharge.q_mobile for discharge in self.discharges])
-        return float(q_C.min()) * exp(-unseen_of_life(q_C)) / _GROWTH, self.q_mobile_bounds_C[1]
+        return float(q_C.min()) * exp(-uncovered_life(q_C)) / _GROWTH, self.q_mobile_bounds_C[1]
 
     def error_at_V(self, q_mobile_C: float) -> float:
         """The error to expect at some ``q_mobile``, C, in V: the larger the farther that age is from those fitted."""
         q_C = np.array([discharge.q_mobile for discharge in self.discharges])
-        near_V2 = max(self.mismatch_V**2 - aged_V(unseen_of_life(q_C)) ** 2, self.rmse_V**2)
-        apart = max(log(q_C.min() / q_mobile_C), log(q_mobile_C / q_C.max()), 0.0)
-        return hypot(sqrt(near_V2), aged_V(apart))
+        near_V2 = max(self.mismatch_V**2 - aged_V(uncovered_life(q_C)) ** 2, self.rmse_V**2)
+        log_distance = max(log(q_C.min() / q_mobile_C), log(q_mobile_C / q_C.max()), 0.0)
+        return hypot(sqrt(near_V2), aged_V(log_distance))
 
     def summary(self) -> str:
         """The fit in a few lines."""
@@ -325,11 +325,11 @@ def groups(q_mobile_C: ArrayLike) -> list[tuple[IntArray, IntArray]]:
     return [(group, np.setdiff1d(order, group)) for group in groups if len(group) < len(order)]
 
 
-def aged_V(apart: float) -> float:
+def aged_V(log_distance: float) -> float:
     """The error to expect of constants at ages whose logarithms of ``q_mobile`` are so far apart from those fitted."""
-    return UNFITTED_MISMATCH_V * apart / _LIFE
+    return UNFITTED_MISMATCH_V * log_distance / _LIFE
 
 
-def unseen_of_life(q_mobile_C: FloatArray) -> float:
+def uncovered_life(q_mobile_C: FloatArray) -> float:
     """How much of a life lies outside of the ages of some discharges, as a logarithm of ``q_mobile``."""
     return max(_LIFE - float(np.log(q_mobile_C.max() / q_mobile_C.min())), 0.0)

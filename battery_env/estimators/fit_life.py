@@ -23,11 +23,11 @@ from battery_env.records import CUT_OFF_V, Record, check_record
 from battery_env.records.discharge import Discharge
 from battery_env.records.model import RecordModel
 
-# So many ages of a life are fitted, and so many of them at once for the constants that all share.
+# Ages of a life that are fitted one by one, and ages that are fitted at once for the constants that all share.
 _AGES, _JOINT_AGES = 12, 6
-# How strongly the priors of a single age weigh: the error of its model, V.
+# Error of the model of a single age, V: the smaller, the less its priors weigh.
 _MISMATCH_V = 0.005
-# How nearly q_mobile is that of the constants known before.
+# Standard deviation of q_mobile around that with the constants before the fit, as a share.
 _SAME_Q_SHARE = 0.002
 
 

@@ -26,7 +26,7 @@ from battery_env.estimators.cell_fit import (
     FittedDischarge,
     aged_V,
     groups,
-    unseen_of_life,
+    uncovered_life,
 )
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, BELOW_REST_V, usual_start
@@ -171,8 +171,8 @@ def _check_ends(lowest_V: float, cut_off_V: float) -> None:
 
 def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> None:
     """Refuse discharges that cannot all start full: a full cell, of whatever kind, rests at about one voltage."""
-    found = enumerate(zip(records, at_rest, strict=True), start=1)
-    rests = [(float(each.voltage_V[0]), _name(each, n)) for n, (each, rested) in found if rested]
+    numbered = enumerate(zip(records, at_rest, strict=True), start=1)
+    rests = [(float(each.voltage_V[0]), _name(each, n)) for n, (each, rested) in numbered if rested]
     (low_V, low), (high_V, high) = min(rests, default=(0.0, "")), max(rests, default=(0.0, ""))
     if high_V - low_V > BELOW_REST_V + ABOVE_REST_V:
         raise ValueError(
@@ -182,12 +182,12 @@ def _check_starts_alike(records: Sequence[Record], at_rest: Sequence[bool]) -> N
 
 
 def _prior(records: Sequence[Record], start: CellParameters | None, thermal: bool, cut_off_V: float) -> CellParameters:
-    """Return what is thought of the constants before the data, but for what is measured."""
+    """The constants before the fit, with the cut-off and the temperature that are measured."""
     check_cell(start, thermal)
     q_mobile = float(Q_MOBILE.check(Q_MOBILE_PER_CAPACITY * max(drawn_charge_C(record) for record in records)))
     start = new_cell_of(q_mobile) if start is None else start
-    known = [getattr(record, "temperature_C", None) for record in records]
-    temperatures_C = [column[0] for column in known if column is not None]
+    columns = [getattr(record, "temperature_C", None) for record in records]
+    temperatures_C = [column[0] for column in columns if column is not None]
     measured = {"Tb0": ZERO_CELSIUS_K + float(np.mean(temperatures_C))} if temperatures_C else {}
     return start.replace(VEOD=float(cut_off_V), **measured)
 
@@ -230,12 +230,12 @@ class JointFit:
         self.charges_C = np.array([drawn_charge_C(record) for record in records])
 
     @cached_property
-    def before(self) -> list[tuple[Estimate, float]]:
-        """With the constants known before, what fits best to each discharge, and the error left, V."""
-        return [self._alone(dict.fromkeys(self.sd, 0.0), d) for d in range(len(self.searches))]
+    def fits_before(self) -> list[tuple[Estimate, float]]:
+        """The best fit of each discharge with the constants before the fit, and its error, V."""
+        return [self._fit_with(dict.fromkeys(self.sd, 0.0), d) for d in range(len(self.searches))]
 
-    def _alone(self, constants: dict[str, float], d: int) -> tuple[Estimate, float]:
-        """With some constants, what fits best to one discharge, and the error left (root mean square), V."""
+    def _fit_with(self, constants: dict[str, float], d: int) -> tuple[Estimate, float]:
+        """The best fit of one discharge with some constants, and its error (root mean square), V."""
         model, search = self.model, self.searches[d]
         cell = search.model_at(constants).cell
         estimate = LeastSquares(cell=cell, thermal=model.thermal, dt_s=model.dt_s).estimate(self.records[d])
@@ -243,8 +243,8 @@ class JointFit:
         return estimate, _rms(residual_V)
 
     def starts(self) -> list[list[dict[str, float]]]:
-        """Where to start: at the constants known before."""
-        constants, estimates = dict.fromkeys(self.sd, 0.0), [estimate for estimate, _ in self.before]
+        """Where to start: at the constants before the fit."""
+        constants, estimates = dict.fromkeys(self.sd, 0.0), [estimate for estimate, _ in self.fits_before]
         least_C = np.array([search.least_q_C for search in self.searches])
         fitted_C = np.maximum([each.q_mobile for each in estimates], (1.0 + _LEAST_EXCESS) * least_C)
         return [
@@ -255,8 +255,8 @@ class JointFit:
     def solve(self) -> CellFit:
         """The best fit that is found from any start, with the weights that its residuals imply."""
         search = self._weighed_by(_Weights(_FIRST_MISMATCH_V, np.full(len(self.records), INDEPENDENT_ERRORS)))
-        found = [self._minimized(search, start) for start in self.starts()]
-        best = min(found, key=lambda values: square(search.weighed(values)[0]))
+        fits = [self._minimized(search, start) for start in self.starts()]
+        best = min(fits, key=lambda values: square(search.weighed(values)[0]))
         for _ in range(_ROUNDS):
             search = self._weighed_by(self._weights(search, best))
             best = self._minimized(search, best)
@@ -295,12 +295,12 @@ class JointFit:
         if len(values) == 1:
             return [self._parts_left_out_V(search, values)]
         errors_V: list[float | None] = [None] * len(values)
-        for group, kept in groups([at["q_mobile"] for at in values]):
-            others = replace(search, searches=[search.searches[d] for d in kept])
-            fitted = self._minimized(others, [values[d] for d in kept])[0]
+        for group, others in groups([at["q_mobile"] for at in values]):
+            without_group = replace(search, searches=[search.searches[d] for d in others])
+            fitted = self._minimized(without_group, [values[d] for d in others])[0]
             for d in group.tolist():
                 try:
-                    errors_V[d] = self._alone({name: fitted[name] for name in self.sd}, d)[1]
+                    errors_V[d] = self._fit_with({name: fitted[name] for name in self.sd}, d)[1]
                 except ValueError as error:
                     raise ValueError(
                         f"constants fitted to the other discharges cannot follow {self.names[d]}: leave it out"
@@ -324,15 +324,15 @@ class JointFit:
         return min(_rms(search.searches[0].error_at_samples.noise_V * left_out), UNFITTED_MISMATCH_V)
 
     def _expected_V(self, discharges: Sequence[FittedDischarge], residual_V: float) -> float:
-        """The error to expect of any discharge of the cell: of those left out, and of ages and charges that none shows."""
+        """The error to expect of any discharge: of discharges left out, and of ages and charges that no discharge covers."""
         q_mobile_C = np.array([each.q_mobile for each in discharges])
-        shown_V = [each.left_out_V for each in discharges if each.left_out_V is not None]
+        left_out_V = [each.left_out_V for each in discharges if each.left_out_V is not None]
         undrawn = 1.0 - float((self.charges_C / q_mobile_C).max())
-        unseen_V = hypot(aged_V(unseen_of_life(q_mobile_C)), UNFITTED_MISMATCH_V * max(undrawn, 0.0))
-        return hypot(max(residual_V, _rms(np.array(shown_V or [0.0]))), unseen_V)
+        uncovered_V = hypot(aged_V(uncovered_life(q_mobile_C)), UNFITTED_MISMATCH_V * max(undrawn, 0.0))
+        return hypot(max(residual_V, _rms(np.array(left_out_V or [0.0]))), uncovered_V)
 
     def _result(self, search: JointSearch, values: Sequence[dict[str, float]], mismatch_V: float) -> CellFit:
-        """What was found."""
+        """The fit as data."""
         start, cell = self.model.cell, search.searches[0].model_at(values[0]).cell
         sds = standard_deviations(search.weighed(values)[1]).tolist()
         constants = []
@@ -349,7 +349,7 @@ class JointFit:
                 sd_q_mobile=sds[2 * d],
                 sd_r_o=sds[2 * d + 1],
                 rmse_V=_rms(residuals_V[d]),
-                rmse_before_V=self.before[d][1],
+                rmse_before_V=self.fits_before[d][1],
                 left_out_V=left_out_V,
                 current_A=mean_current_A(self.records[d]),
             )
@@ -369,8 +369,8 @@ class JointFit:
 
 
 def _thinned(search: Search) -> Search:
-    kept = spread_over(len(search.data.time_s), _MOST_SAMPLES)
-    data = replace(search.data, time_s=search.data.time_s[kept], voltage_V=search.data.voltage_V[kept])
+    spread = spread_over(len(search.data.time_s), _MOST_SAMPLES)
+    data = replace(search.data, time_s=search.data.time_s[spread], voltage_V=search.data.voltage_V[spread])
     return replace(search, data=data)
 
 

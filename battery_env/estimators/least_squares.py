@@ -55,9 +55,9 @@ from battery_env.records import (
 )
 from battery_env.records.model import RecordModel
 
-# Noise told from residuals is not below the resolution of a voltmeter, V.
+# Least noise that is estimated from residuals, V: a voltmeter's resolution. No estimate of the bundled cells depends on it.
 _LEAST_NOISE_V = 1e-4
-# The effect of the charge at the start is taken over this step.
+# Step of the state of charge for a derivative. Twice as much changes standard deviations of the bundled cells by 0.1 %.
 _SOC_STEP = 1e-3
 
 
@@ -71,19 +71,19 @@ class Alternative(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordFit:
-    """What the search says of a record, and how sure that is (:meth:`LeastSquares.fit`)."""
+    """The fit of a record by :meth:`LeastSquares.fit`, with all that its standard deviations are made of."""
 
     record: Samples
     history: ChargeHistory
     search: Search
     fit: Fit  # with all priors
-    alone: Fit  # without the prior of q_mobile
-    variance: float  # of one residual as it is weighed
-    hidden_sd: Mapping[str, float]  # of what does not show in the voltage, charges that nobody saw among it, by parameter
-    evidence: Evidence  # what the samples show
+    without_prior: Fit  # of q_mobile
+    variance: float  # of one weighed residual
+    hidden_sd: Mapping[str, float]  # uncertainty that the voltage cannot reveal, by parameter
+    evidence: Evidence  # of the samples
 
     def sd(self, fit: Fit, ratios: Mapping[str, float]) -> dict[str, float]:
-        """The standard deviations of a fit, so many times as large as it says, with those of what does not show."""
+        """The standard deviations of a fit, times some ratios, with the uncertainty that the voltage cannot reveal."""
         sd = dict.fromkeys(PARAMETER_NAMES, nan)
         for name, root in zip(self.search.parameters, standard_deviations(fit.jacobian), strict=False):
             ratio = ratios.get(name, 1.0) * (fit.spread if name == "q_mobile" else 1.0)
@@ -112,7 +112,7 @@ class RecordFit:
 
 
 class _Resistance(NamedTuple):
-    """The resistance after ten seconds, its standard deviation, and what of that is by the moment of load-on, ohm."""
+    """The resistance after ten seconds, its standard deviation, and the share of the unknown moment of load-on in it, ohm."""
 
     ohm: float = nan
     sd_ohm: float = nan
@@ -210,8 +210,9 @@ class LeastSquares(Estimator):
             cell, mismatch_V = cell or path.cell, mismatch_V or path.mismatch_V
         self.initial_soc = check_initial_soc(initial_soc)
         self.model = RecordModel(cell, thermal, dt_s, initial, self.initial_soc[0])
-        known = self.model.cell, mismatch_V, initial is None
-        self.prior = CellPrior(*known, sds, sd_ratio=1.0) if path is None else PathPrior.of(path, *known)
+        self.prior = CellPrior(self.model.cell, mismatch_V, initial is None, sds, sd_ratio=1.0)
+        if path is not None:
+            self.prior = PathPrior.of(path, self.model.cell, mismatch_V, initial is None)
         self.bounds = check_bounds(q_mobile_bounds_C, r_o_bounds_ohm)
         if prior_q_mobile_C is not None:
             if "q_mobile" not in self.parameters:
@@ -257,16 +258,16 @@ class LeastSquares(Estimator):
         return [self._growing_trace(record, self.window_every_s) for record in records]
 
     def _growing_trace(self, record: Record, every_s: float) -> EstimateTrace:
-        whole = self._samples(record)
-        time_s = whole.time_s
-        samples = np.searchsorted(time_s, np.arange(time_s[0] + every_s, time_s[-1], every_s), side="right")
+        available = self._samples(record)
+        time_s = available.time_s
+        counts = np.searchsorted(time_s, np.arange(time_s[0] + every_s, time_s[-1], every_s), side="right")
         # the current of a sample shows at the next one
-        fewest = max(len(self.parameters), int((whole.current_A != 0.0).argmax()) + 1) + 1
-        stops = np.unique(np.append(samples[samples >= fewest], len(time_s)))
+        fewest = max(len(self.parameters), int((available.current_A != 0.0).argmax()) + 1) + 1
+        stops = np.unique(np.append(counts[counts >= fewest], len(time_s)))
         estimates: list[Estimate] = []
         for stop in stops:
             previous = estimates[-1] if estimates else None
-            estimates.append(self.estimate_of(self._fit(whole.first(stop), self._history(record), previous)))
+            estimates.append(self.estimate_of(self._fit(available.first(stop), self._history(record), previous)))
         return EstimateTrace.of(time_s[stops - 1], estimates)
 
     def _samples(self, record: Record) -> Samples:
@@ -295,7 +296,7 @@ class LeastSquares(Estimator):
         )
 
     def _fit(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> RecordFit:
-        """The best fits with and without the prior, and what their standard deviations are made of."""
+        """The best fits with and without the prior, with all that their standard deviations are made of."""
         prior, noise_V, usual_C = self.prior, self.voltage_noise_V or 0.0, self.usual_q_mobile_C
         is_open = "q_mobile" in self.parameters
         search = Search.of(record, self.model, self.parameters, prior.nuisance, self.bounds)
@@ -319,22 +320,23 @@ class LeastSquares(Estimator):
             fit = replace(fit, spread=search.spread(fit, priors, variance), knee_sd_C=knee_C)
         # a settled estimate rests neither on a usual size, which nobody stated, nor on what goes together along a path
         loose = np.pad(np.diag([1.0 / sd for sd in prior.nuisance.values()]), ((0, 0), (len(self.parameters), 0)))
-        alone = replace(fit, jacobian=np.vstack([fit.jacobian[:n], loose]))
+        without_prior = replace(fit, jacobian=np.vstack([fit.jacobian[:n], loose]))
         variance += prior.more_variance(record, fit, error, noise_V)
         if self.prior_q_mobile_C is not None:
             mean_C, sd_C = self.prior_q_mobile_C
             carried = Prior("q_mobile", mean_C, prior.sd_ratio * sqrt(variance) / sd_C)
-            fit = search.best([alone.values, *search.starts([mean_C])[0]], [*priors, carried])
+            fit = search.best([without_prior.values, *search.starts([mean_C])[0]], [*priors, carried])
             fit = replace(fit, spread=search.spread(fit, [*priors, carried], variance))
         estimate, soc = [fit.values[name] for name in PARAMETER_NAMES], self.initial_soc[0] if prior.starts_at_rest else None
         evidence = evidence_of(record, self.model.cell, soc, estimate, history, _model_V(record, fit))
         hidden_sd = self._hidden_sd(search, fit, evidence.sd_charge_C)
-        return RecordFit(record, history, search, fit, alone, variance, hidden_sd, evidence)
+        return RecordFit(record, history, search, fit, without_prior, variance, hidden_sd, evidence)
 
     def _hidden_sd(self, search: Search, fit: Fit, sd_charge_C: float) -> dict[str, float]:
         """
-        The standard deviations of what does not show in the voltage: the gain of the current sensor, which scales both
-        parameters, and the charge at the start, which the fit makes up for. A charge that nobody saw is like one of these.
+        The standard deviations that the voltage cannot reveal: of the gain of the current sensor, which scales both
+        parameters, and of the charge at the start, which the fit compensates. A charge that was not measured counts as one at
+        the start.
         """
         (soc, sd_soc), values, model = self.initial_soc, fit.values, self.model
         sd_soc = hypot(sd_soc, sd_charge_C / values["q_mobile"])
@@ -346,11 +348,11 @@ class LeastSquares(Estimator):
                 for each in (soc, soc + step)
             )
             at_V = fit.residual_V if self.prior.starts_at_rest else at.residual(values)[0]
-            moved = dict(values)
+            compensated = dict(values)
             if "q_mobile" in self.parameters:  # along with it, so that the cell ends as full as before
-                moved["q_mobile"] *= soc / (soc + step)
-                by_soc[self.parameters.index("q_mobile")] = (moved["q_mobile"] - values["q_mobile"]) / step
-            change_V = (nearby.residual(moved)[0] - at_V) / step
+                compensated["q_mobile"] *= soc / (soc + step)
+                by_soc[self.parameters.index("q_mobile")] = (compensated["q_mobile"] - values["q_mobile"]) / step
+            change_V = (nearby.residual(compensated)[0] - at_V) / step
             weighed = search.error_at_samples.whitened(np.nan_to_num(change_V)[:, None])[:, 0]
             rows = np.append(weighed, np.zeros(len(fit.jacobian) - len(weighed)))
             by_soc -= np.linalg.lstsq(fit.jacobian, rows, rcond=None)[0]
@@ -365,75 +367,80 @@ class LeastSquares(Estimator):
         step = load_on(record, history.at_rest) if self.prior.starts_at_rest and self.parameters == PARAMETER_NAMES else None
         if step is None or not step.stays:
             return _Resistance()
-        found = ModelResistance.of(record, step, fitted.search, fit)
-        load_on_ohm = found.per_s * history.load_on_C / step.size_A
-        fit_ohm = self.prior.sd_ratio * sqrt(fitted.variance) * found.sd_ohm
-        return _Resistance(found.ohm, hypot(fit_ohm, load_on_ohm, self.current_gain_sd * found.ohm), load_on_ohm)
+        resistance = ModelResistance.of(record, step, fitted.search, fit)
+        load_on_ohm = resistance.per_s * history.load_on_C / step.size_A
+        fit_ohm = self.prior.sd_ratio * sqrt(fitted.variance) * resistance.sd_ohm
+        return _Resistance(resistance.ohm, hypot(fit_ohm, load_on_ohm, self.current_gain_sd * resistance.ohm), load_on_ohm)
 
     def _differing(self, fitted: RecordFit) -> dict[str, float]:
-        """What was measured of a load whose voltage falls otherwise than that of the model; nothing where both agree."""
+        """The measured and the modelled resistance of a step of the load, if they contradict each other; nothing else."""
         record, history = fitted.record, fitted.history
         # constants that are held, and may be wrong, explain a difference as well
         is_open = self.parameters == PARAMETER_NAMES and any(name in self.prior.nuisance for name in RATE_CONSTANTS)
         step = (load_on(record, history.at_rest) or later_step(record)) if is_open else None
-        model_V, root = _model_V(record, fitted.alone), self.prior.sd_ratio * sqrt(fitted.variance)
-        for after_s in (PULSE_S, STEADY_S):  # what lags by less than these shows at one of them
-            if step is None or not step.is_seen(record, after_s):
+        model_V, sd_unit = _model_V(record, fitted.without_prior), self.prior.sd_ratio * sqrt(fitted.variance)
+        for after_s in (PULSE_S, STEADY_S):  # a difference that decays is seen at one of these times
+            if step is None or not step.is_measured(record, after_s):
                 continue
             measured_ohm = step.fall_ohm(record, record.time_s, record.voltage_V, after_s)
             model_ohm = step.fall_ohm(record, record.time_s, model_V, after_s)
-            of_model = ModelResistance.of(record, step, fitted.search, fitted.alone, after_s)
-            sd_ohm = root * of_model.sd_ohm
-            noise_ohm = MOST_NOISE_SD * root * fitted.search.error.noise_V / step.size_A
+            of_model = ModelResistance.of(record, step, fitted.search, fitted.without_prior, after_s)
+            sd_ohm = sd_unit * of_model.sd_ohm
+            noise_ohm = MOST_NOISE_SD * sd_unit * fitted.search.error.noise_V / step.size_A
             apart_ohm = abs(measured_ohm - model_ohm)
-            # the moment of the switch may be another one in what was measured, and in what was fitted
+            # the measurement and the fit may have different moments of the switch
             if apart_ohm > 2.0 * of_model.moment_ohm + hypot(RESISTANCE_LIMIT_SD * sd_ohm, noise_ohm):
-                found = {"after_s": after_s, "step_s": step.on_s, "measured_ohm": measured_ohm, "model_ohm": model_ohm}
-                return {**found, "apart_sd": apart_ohm / sd_ohm}
+                measured = {"after_s": after_s, "step_s": step.on_s, "measured_ohm": measured_ohm, "model_ohm": model_ohm}
+                return {**measured, "apart_sd": apart_ohm / sd_ohm}
         return {}
 
     def _verdict(self, fitted: RecordFit) -> Verdict:
-        """What speaks against an estimate."""
+        """Judge an estimate by all that contradicts it."""
         record, history = fitted.record, fitted.history
-        fit, alone, evidence, (soc, sd_soc) = fitted.fit, fitted.alone, fitted.evidence, self.initial_soc
+        fit, without_prior, evidence, (soc, sd_soc) = fitted.fit, fitted.without_prior, fitted.evidence, self.initial_soc
         diagnosis = Diagnosis(evidence, evidence.measured(soc, float(record.time_s[0]), history.charge))
         n, free, is_stated = len(fit.residual_V), self.parameters, self.voltage_noise_V is not None
         diagnosis.note(Reason.EMPTY, n < len(record.time_s))
         diagnosis.note(Reason.FEW, not is_stated and n < len(free) + SPARE_SAMPLES)
         noise_V = self.voltage_noise_V or white_noise_V(fit.residual_V)
-        # of a path the error is what its cells leave, and else what the drift allows for
+        # the error along a path is the mismatch of its cells, and otherwise the drift
         drift_V = fitted.search.error.drift_V or self.prior.mismatch_V
         diagnosis.note(Reason.MISFIT, square(fit.residual_V) > n * misfit_limit_V2(noise_V, n, drift_V, is_stated))
         q_mobile = fit.values["q_mobile"]
         diagnosis.note(Reason.IMPLAUSIBLE, "q_mobile" in free and not is_plausible(q_mobile, self.model.cell.q_mobile))
         ratio = self.prior.distance_share(fit.values)
         diagnosis.note(Reason.OTHER_KIND, ratio > 1.0, what="distance from the path of aging cells", ratio=ratio)
-        moved = fit.square - alone.square
-        is_far = moved > (self.prior.sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance
+        limit = (self.prior.sd_ratio * PRIOR_LIMIT_SD) ** 2 * fitted.variance
         mean_C, sd_C = self.prior_q_mobile_C or (nan, nan)
-        expected_C = {"least_Ah": mean_C - PRIOR_LIMIT_SD * sd_C, "most_Ah": mean_C + PRIOR_LIMIT_SD * sd_C}
-        sizes_Ah = {name: size_C / 3600.0 for name, size_C in {"record_Ah": alone.values["q_mobile"], **expected_C}.items()}
-        diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, is_far, **sizes_Ah)
+        sizes_C = {
+            "record_Ah": without_prior.values["q_mobile"],
+            "least_Ah": mean_C - PRIOR_LIMIT_SD * sd_C,
+            "most_Ah": mean_C + PRIOR_LIMIT_SD * sd_C,
+        }
+        sizes_Ah = {name: size_C / 3600.0 for name, size_C in sizes_C.items()}
+        diagnosis.note_about("q_mobile", Reason.PRIOR_WRONG, fit.square - without_prior.square > limit, **sizes_Ah)
         differing = self._differing(fitted)
         diagnosis.note(Reason.RESISTANCE_DIFFERS, bool(differing), **differing)
         for name in fit.at_bound:
             diagnosis.note_about(name, Reason.AT_BOUND)
         priors = [] if self.prior_q_mobile_C is None else ["q_mobile"]
-        resistance = self._resistance(fitted, alone)
-        known = Assumptions(
+        resistance = self._resistance(fitted, without_prior)
+        assumptions = Assumptions(
             self.current_gain_sd,
             sd_soc / soc,
-            knee_sd_C=alone.knee_sd_C,
+            knee_sd_C=without_prior.knee_sd_C,
             load_on_ohm=resistance.load_on_ohm,
             is_along_path=isinstance(self.prior, PathPrior),
         )
-        # where the record has it and where a prior has moved it: beside its knee the voltage says little of q_mobile
-        moved_there = replace(alone, jacobian=np.vstack([fit.jacobian[:n], alone.jacobian[n:]]))
-        own_sds = [fitted.sd(each, {"q_mobile": self.prior.sd_ratio}) for each in (alone, moved_there)]
-        sds = {name: max(sd[name] for sd in own_sds) for name in free}
+        # without the prior, at both optima; the larger one counts: before the knee the voltage says little of q_mobile
+        at_prior_optimum = replace(without_prior, jacobian=np.vstack([fit.jacobian[:n], without_prior.jacobian[n:]]))
+        ratios = {"q_mobile": self.prior.sd_ratio}
+        sds_without_prior = [fitted.sd(each, ratios) for each in (without_prior, at_prior_optimum)]
+        sds = {name: max(sd[name] for sd in sds_without_prior) for name in free}
         if not isnan(resistance.ohm):
             sds["resistance_10s"] = resistance.sd_ohm
-        return diagnosis.verdict(alone.values | {"resistance_10s": resistance.ohm}, sds, list(sds), priors, known)
+        values = without_prior.values | {"resistance_10s": resistance.ohm}
+        return diagnosis.verdict(values, sds, list(sds), priors, assumptions)
 
 
 def _model_V(record: Samples, fit: Fit) -> FloatArray:

@@ -26,21 +26,13 @@ _STARTS_SD, _START_ABOVE = (-1.5, -0.5, 0.5, 1.5), 0.02
 
 @dataclass(frozen=True)
 class CellPrior:
-    """
-    Constants of a cell, each of which is known to some standard deviation.
-
-    :param cell: the constants
-    :param mismatch_V: expected error of the model, V
-    :param starts_at_rest: whether the first sample is the voltage of the cell at rest
-    :param nuisance: standard deviations of the unknowns besides both parameters, by name
-    :param sd_ratio: how many times as large as a fit says its standard deviations are
-    """
+    """Constants of a cell, each of which is known to some standard deviation."""
 
     cell: CellParameters
-    mismatch_V: float
-    starts_at_rest: bool
-    nuisance: Mapping[str, float]
-    sd_ratio: float
+    mismatch_V: float  # expected error of the model
+    starts_at_rest: bool  # whether the first sample is the voltage of the cell at rest
+    nuisance: Mapping[str, float]  # standard deviations of the unknowns besides both parameters
+    sd_ratio: float  # how many times as large as a fit says its standard deviations are
 
     def with_fixed_rates(self) -> CellPrior:
         """With known rate constants, as those of all discharges of a cell."""

@@ -1,6 +1,6 @@
 """
-The resistance after ten seconds, which a meter shows: the fall of the voltage from before the load to ten seconds later, over
-the current. Of a fitted model it has a standard deviation, and a record shows it without any model.
+The resistance after ten seconds, as meters report it: the fall of the voltage from before the load to ten seconds later, over
+the current. A fitted model gives it with a standard deviation; a record gives it without any model.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class LoadStep(NamedTuple):
         before_V, after_V = np.interp([record.time_s[self.before], self.on_s + after_s], time_s, voltage_V)
         return float(before_V - after_V) / self.size_A
 
-    def is_seen(self, record: Record, after_s: float = PULSE_S) -> bool:
-        """Whether samples lie so much later on both sides, near enough to tell the voltage there, before another switch."""
+    def is_measured(self, record: Record, after_s: float = PULSE_S) -> bool:
+        """Whether samples lie before and after that time, near enough to interpolate, and before another switch."""
         after = int(np.searchsorted(record.time_s, self.on_s + after_s))
         if not self.before + 1 < after < len(record.time_s):
             return False
@@ -65,9 +65,9 @@ def later_step(record: Record) -> LoadStep | None:
 
 
 def measured_resistance_ohm(record: Record, starts_at_rest: bool) -> float:
-    """The resistance after ten seconds as measured, ohm; NaN where the record does not show it."""
+    """The resistance after ten seconds as measured, ohm; NaN without such a step, or without samples around its end."""
     step = load_on(record, starts_at_rest)
-    if step is None or not step.stays or not step.is_seen(record):
+    if step is None or not step.stays or not step.is_measured(record):
         return float("nan")
     return step.fall_ohm(record, record.time_s, record.voltage_V)
 
@@ -78,9 +78,8 @@ class ModelResistance(NamedTuple):
 
     :param ohm: its value
     :param sd_ohm: its standard deviation, for residuals of one
-    :param per_s: how much of it a second makes by which the step may be earlier or later, ohm/s, or at the first sample under
-        the load, where that is later
-    :param moment_ohm: how far it is at most from that of a step as early or as late as the samples allow, ohm
+    :param per_s: its slope by the time since the step, ohm/s, there or at the first sample under load, whichever is later
+    :param moment_ohm: its largest change if the step is as early or as late as the samples allow, ohm
     """
 
     ohm: float
@@ -90,7 +89,7 @@ class ModelResistance(NamedTuple):
 
     @classmethod
     def of(cls, record: Record, step: LoadStep, search: Search, fit: Fit, after_s: float = PULSE_S) -> ModelResistance:
-        """That of a fit to a record, so long after the step."""
+        """The resistance of a fit to a record, at some time after the step."""
         grid_s, voltages = record.time_s[0] + search.data.grid_s, search.voltage(fit.values)
         ohm, *by_unknown = (step.fall_ohm(record, grid_s, each, after_s) for each in voltages)
         sd_ohm = root_variance(fit.jacobian, np.array(by_unknown))

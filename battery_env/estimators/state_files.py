@@ -33,8 +33,8 @@ class Saved:
 
     def _restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Take :meth:`_arrays` of another one for its own."""
-        for name, own in self._arrays().items():
-            own[...] = arrays[name]
+        for name, array in self._arrays().items():
+            array[...] = arrays[name]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """
@@ -51,8 +51,8 @@ class Saved:
         np.savez(arrays, allow_pickle=False, **self._arrays())
         described = f'{_BEGINNING}, "format": {FORMAT_VERSION}, "settings": {json.dumps(self._made_with())}}}\n'
         content = described.encode() + arrays.getvalue()
-        with replacing(target) as part:
-            part.write_bytes(content + sha256(content).digest())
+        with replacing(target) as file:
+            file.write_bytes(content + sha256(content).digest())
         return target
 
     def load(self, path: str | os.PathLike[str]) -> None:
@@ -64,8 +64,8 @@ class Saved:
         :raises ValueError: if it is damaged, of another version, or of an estimator with other arguments; this one is as it
             was then
         """
-        whole = Path(path).read_bytes()
-        content, digest = whole[:-_DIGEST_SIZE], whole[-_DIGEST_SIZE:]
+        data = Path(path).read_bytes()
+        content, digest = data[:-_DIGEST_SIZE], data[-_DIGEST_SIZE:]
         if not content.startswith(_BEGINNING.encode()) or sha256(content).digest() != digest:
             raise ValueError(f"{path} is damaged, or no state of an estimator: it is not what was saved")
         line, _, arrays = content.partition(b"\n")
@@ -82,5 +82,5 @@ class Saved:
                 f"{path} is of an estimator with {name} = {saved.get(name)!r}, this one has {own.get(name)!r}: make one with "
                 f"the same arguments (different: {', '.join(different)})"
             )
-        with np.load(BytesIO(arrays), allow_pickle=False) as found:
-            self._restore(dict(found))
+        with np.load(BytesIO(arrays), allow_pickle=False) as archive:
+            self._restore(dict(archive))

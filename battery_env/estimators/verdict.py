@@ -1,6 +1,6 @@
 """
-Which numbers of an estimate are settled, and why not both: one function of an estimate, its standard deviations and the
-evidence of its record, for all calibrators.
+Which numbers of an estimate are settled, and the reasons against the others: one function of an estimate, its standard
+deviations and the evidence of its record, for all calibrators.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Assumptions(NamedTuple):
     gain_sd: float = 0.0  # of the current sensor, which scales both parameters
     sd_soc: float = 0.0  # of the charge at the start, as a share of it
     knee_sd_C: float = 0.0  # of the charge beyond the knee of the model
-    apart: Mapping[str, float] = MappingProxyType({})  # how far a policy is from the fit in its observation, by number
+    distance_from_fit: Mapping[str, float] = MappingProxyType({})  # of a policy, from the fit in its observation, by number
     load_on_ohm: float = 0.0  # of the resistance after ten seconds, by the moment of load-on
     is_along_path: bool = False  # whether these constants lie along a path of aging cells
 
@@ -60,7 +60,7 @@ class Verdict(NamedTuple):
 
 
 class _Against(NamedTuple):
-    """What speaks against a number: a reason, the number that it names, and of a doubt which one, and how much."""
+    """A reason against a number, with the number that it names; of a doubt also which doubt, and its size."""
 
     reason: Reason
     about: str = ""
@@ -76,10 +76,10 @@ class _Against(NamedTuple):
 
 class Diagnosis:
     """
-    What speaks against the estimate of one whole record.
+    The reasons against the estimate of one record.
 
-    :param evidence: what its samples show; ``None``: nothing
-    :param measured: what texts say of them, by the names in their braces
+    :param evidence: of its samples; ``None``: without a finding
+    :param measured: the values in the texts of findings, by the names in their braces
     """
 
     def __init__(self, evidence: Evidence | None = None, measured: Mapping[str, Any] | None = None) -> None:
@@ -106,24 +106,25 @@ class Diagnosis:
         sds: Mapping[str, float],
         searched: Collection[str] = (),
         priors: Collection[str] = (),
-        known: Assumptions | None = None,
+        assumptions: Assumptions | None = None,
     ) -> Verdict:
         """
-        Which numbers are settled, by their values and standard deviations as the record alone has them, of those that were
-        searched for, and why not both: first why not the one that is farther beyond its limit.
+        Return which of the numbers that were searched for are settled, by their values and standard deviations from the record
+        alone; and the findings against the others, first against the number that is farthest beyond its limit.
         """
-        known = known or Assumptions()
+        assumptions = assumptions or Assumptions()
         limits = {name: SETTLED_SHARES[name] * values[name] for name in NUMBERS if name in searched}
         is_open = "q_mobile" in limits and not sds["q_mobile"] < limits["q_mobile"]
         against, findings = list(self._against), {}
         if is_open and self._evidence.missed_C > MOST_OF_SD * sds["q_mobile"]:
             against.append(_Against(Reason.MISSED))
         for name in NUMBERS:
-            own = [_Against(Reason.PATH_UNTESTED, name)] if is_open and known.is_along_path and name != "q_mobile" else []
+            is_untested = is_open and assumptions.is_along_path and name != "q_mobile"
+            of_number = [_Against(Reason.PATH_UNTESTED, name)] if is_untested else []
             if name in limits:
-                own += self._against_one(name, values[name], sds[name], name in priors, known)
+                of_number += self._against_one(name, values[name], sds[name], name in priors, assumptions)
             # the row of the table that comes first counts
-            findings[name] = min([*against, *own], key=lambda each: each.reason, default=None)
+            findings[name] = min([*against, *of_number], key=lambda each: each.reason, default=None)
         # where there is a resistance that a meter shows, that of the model need not be settled
         resistance = "resistance_10s" if "resistance_10s" in limits else "r_o"
         # a resistance of 0 is as far beyond its limit as can be
@@ -135,19 +136,21 @@ class Diagnosis:
         settled_q_mobile, settled_r_o, settled_10s = (findings[name] is None for name in NUMBERS)
         return Verdict(settled_q_mobile, settled_r_o, tuple(in_order), settled_10s and resistance == "resistance_10s")
 
-    def _against_one(self, name: str, value: float, sd: float, has_prior: bool, known: Assumptions) -> Iterator[_Against]:
-        """What its standard deviation says against a number, of those of one reason the first that counts."""
+    def _against_one(
+        self, name: str, value: float, sd: float, has_prior: bool, assumptions: Assumptions
+    ) -> Iterator[_Against]:
+        """The reasons against a number that follow from its standard deviation."""
         is_charge, share = name == "q_mobile", SETTLED_SHARES[name]
         doubts: dict[Doubt, float] = {}
         if not sd < share * value:
             if is_charge:
-                doubts = {**self._evidence.charges_C, Doubt.KNEE: known.knee_sd_C}
+                doubts = {**self._evidence.charges_C, Doubt.KNEE: assumptions.knee_sd_C}
             elif name == "resistance_10s":
-                doubts = {Doubt.LOAD_ON: known.load_on_ohm}
-            doubts[Doubt.POLICY] = known.apart.get(name, 0.0)
+                doubts = {Doubt.LOAD_ON: assumptions.load_on_ohm}
+            doubts[Doubt.POLICY] = assumptions.distance_from_fit.get(name, 0.0)
             if has_prior:
                 yield _Against(Reason.PRIOR_ALONE, name)
-            if hypot(known.gain_sd, known.sd_soc if is_charge else 0.0) >= share:
+            if hypot(assumptions.gain_sd, assumptions.sd_soc if is_charge else 0.0) >= share:
                 yield _Against(Reason.SCALE_UNKNOWN, name)
             yield _Against(Reason.IMPRECISE, name)
         if self._evidence.is_smeared and not is_charge:

@@ -21,7 +21,6 @@ from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
-from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import Alternative, LeastSquares, RecordFit
@@ -255,13 +254,13 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, fixed: LeastSquare
     fixed, free = copy(fixed), copy(free)
     fixed.usual_start = free.usual_start = usual_start or fixed.usual_start
     rows = []
-    last_valid: tuple[Estimate, RecordFit] | None = None
+    last_fit: RecordFit | None = None
     for position, discharge in enumerate(discharges):
         row: dict[str, Any] = {"cycle": discharge.meta.get("cycle", position + 1)}
         try:
-            columns, result = _row_of(discharge, cut_off_V, fixed, free)
-            rows.append(row | columns)
-            last_valid = result if columns["valid"] else last_valid
+            fit = free.fit(discharge.loaded_part(cut_off_V))
+            rows.append(row | _row_of(discharge, cut_off_V, fixed, free, fit))
+            last_fit = fit if rows[-1]["valid"] else last_fit
         except ValueError as error:  # of one that cannot be used
             rows.append(
                 row
@@ -274,10 +273,10 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, fixed: LeastSquare
             )
     texts = [{"reason": reason_of(row["findings"])} for row in rows]
     life = life_of(pd.DataFrame([row | text for row, text in zip(rows, texts, strict=True)], columns=_COLUMNS))
-    assert last_valid is not None  # a life without a valid discharge is refused
-    estimate, fit = last_valid
+    assert last_fit is not None  # a life without a valid discharge is refused
+    estimate, alternatives = free.estimate_of(last_fit), last_fit.alternatives()
     sd_share = estimate.sd_q_mobile / estimate.q_mobile
-    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=fit.alternatives())
+    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=alternatives)
 
 
 def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> DischargeStart | None:
@@ -292,15 +291,9 @@ def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> Discharge
     return usual_start(alike) if len(steps) and np.median(steps) <= VARIED_SHARE else None
 
 
-def _row_of(
-    discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: LeastSquares
-) -> tuple[dict[str, Any], tuple[Estimate, RecordFit]]:
-    """
-    Return the row of one discharge in the table, and its estimate and fit with free constants. The resistance in the row is of
-    this estimate, because constants age, too.
-    """
+def _row_of(discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: LeastSquares, fit: RecordFit) -> dict[str, Any]:
+    """Return the row of one discharge in the table; its resistance is of a fit with free constants, because they age, too."""
     record = discharge.loaded_part(cut_off_V)
-    fit = free.fit(record)
     with_free_constants = free.estimate_of(fit)
     estimate = with_free_constants if fixed.prior.nuisance == free.prior.nuisance else fixed.estimate(record)
     end_s = fixed.model.forecast(record, estimate, cut_off_V).eod_time_s
@@ -308,7 +301,7 @@ def _row_of(
     start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
     # a finding about the resistance is none about q_mobile
     of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]
-    row = {
+    return {
         "q_mobile_C": estimate.q_mobile,
         "sd_q_mobile_C": estimate.sd_q_mobile,
         "resistance_10s_ohm": with_free_constants.resistance_10s_ohm,
@@ -323,7 +316,6 @@ def _row_of(
         "mean_current_A": mean_current_A(record),
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
     }
-    return row, (with_free_constants, fit)
 
 
 def life_of(table: pd.DataFrame) -> Life:

@@ -92,8 +92,8 @@ class Confidence:
             diagnosis.note_about(name, Reason.AT_BOUND, estimate[k] in ESTIMATE_RANGES[name])
         values, sds = (dict(zip(PARAMETER_NAMES, column.tolist(), strict=True)) for column in (estimate, sd))
         distances = dict(zip(PARAMETER_NAMES, distance.tolist(), strict=True))
-        assumptions = Assumptions(apart=distances, is_along_path=path is not None)
-        verdict = diagnosis.verdict(values, sds, PARAMETER_NAMES, known=assumptions)
+        assumptions = Assumptions(distance_from_fit=distances, is_along_path=path is not None)
+        verdict = diagnosis.verdict(values, sds, PARAMETER_NAMES, assumptions=assumptions)
         stated_sds = np.hypot(self._sd_ratio * fit.sd[n], common_sd).tolist()
         # the same NaN object, so that equal estimates compare equal
         sd_q_mobile, sd_r_o = (nan if isnan(sd) else sd for sd in stated_sds)

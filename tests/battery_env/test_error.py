@@ -15,7 +15,7 @@ def test_whitened_errors_are_those_of_the_whole_covariance(load):
     time_s = np.cumsum(np.random.default_rng(0).uniform(1.0, 20.0, 80))
     current_A = np.where((load == "pulses") & (time_s % 100.0 < 50.0), 0.2, 2.0)
     error = ErrorModel(drift_V=0.05, noise_V=0.002, r_o=0.1, to=6.0, memory_C=900.0, load_on_C=100.0).along(time_s, current_A)
-    place = np.cumsum(error.way)
+    place = np.cumsum(error.correlation_lengths)
     covariance = 0.05**2 * np.exp(-np.abs(place[:, None] - place)) + np.diag(error.noise_V**2)
     rows = np.random.default_rng(1).normal(size=(80, 3))
     white = error.whitened(rows)

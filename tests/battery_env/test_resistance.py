@@ -81,7 +81,7 @@ def test_what_is_measured_after_another_switch_is_no_resistance_of_the_first():
     record = recorded(simulate(np.repeat([1.0, 2.5, 0.8, 2.0] * 60, 60), 6000.0, 0.15, load_unit="current", cut_off_V=2.69))
     rows = Discharge(record.time_s[::5], record.voltage_V[::5], record.current_A[::5])
     step = later_step(rows)
-    assert step.is_seen(rows, 10.0) and not step.is_seen(rows, 60.0)
+    assert step.is_measured(rows, 10.0) and not step.is_measured(rows, 60.0)
     assert "resistance_differs" not in [each.code for each in calibrate(rows).findings]
 
 

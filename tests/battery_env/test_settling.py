@@ -184,7 +184,7 @@ def test_the_table_decides_what_is_said_first_whoever_notes_it():
 
     def verdict(diagnosis, share_q, share_r_o, known=None):
         sds = {"q_mobile": share_q * values["q_mobile"], "r_o": share_r_o * values["r_o"]}
-        found = diagnosis.verdict(values, sds, ["q_mobile", "r_o"], known=known)
+        found = diagnosis.verdict(values, sds, ["q_mobile", "r_o"], assumptions=known)
         assert not found.settled_resistance_10s  # none is stated
         return found[:3]
 
@@ -211,7 +211,7 @@ def test_where_a_resistance_is_stated_it_counts_in_place_of_that_of_the_model():
 
     def verdict(diagnosis, r_o_ohm, resistance_ohm, **known):
         sds = {"q_mobile": 60.0, "r_o": r_o_ohm, "resistance_10s": resistance_ohm}
-        return diagnosis.verdict(values, sds, list(values), known=Assumptions(**known))
+        return diagnosis.verdict(values, sds, list(values), assumptions=Assumptions(**known))
 
     assert verdict(Diagnosis(), 0.05, 0.01) == (True, False, (), True)
     assert verdict(Diagnosis(), 0.01, 0.05) == (True, True, (Finding("imprecise", "resistance_10s"),), False)

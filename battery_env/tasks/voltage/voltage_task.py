@@ -34,8 +34,6 @@ FURTHEST_SD = 2.0
 
 #: Number of equal stretches of the data so far; an observation has two means a stretch, of less and of more current.
 STRETCHES = 16
-# An estimate needs more readings than parameters
-_FEWEST_READINGS = 3
 #: Sensors of the discharges in episodes.
 SENSORS = RandomSensorErrors(noise_V=(0.001, 0.030), offset_V=0.010)
 
@@ -237,7 +235,8 @@ class VoltageTask(CalibrationTask):
         for row, generator in zip(rows, generators, strict=True):
             n = int(generator.integers(len(self.readings))) if discharge is None else int(discharge)
             length = int(self.readings.count[n])
-            count = int(generator.integers(_FEWEST_READINGS, length, endpoint=True) if reading is None else reading)
+            # an estimate needs more readings than it has parameters
+            count = int(generator.integers(len(PARAMETER_NAMES) + 1, length, endpoint=True) if reading is None else reading)
             if not 1 <= count <= length:
                 raise ValueError(f"options['reading'] must lie within 1 .. {length} for discharge {n}, got {count}")
             self._new_counts[row] = generator.integers(fewest, most + 1, size=self.episode_steps)
