@@ -33,6 +33,7 @@ from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, BELOW_REST_V, us
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.least_squares import LeastSquares
 from battery_env.estimators.search import (
+    MARGIN,
     JointSearch,
     Prior,
     Search,
@@ -66,9 +67,8 @@ _ROUNDS = 3
 _FIRST_MISMATCH_V = 0.02
 #: Each discharge shows so many independent errors of the model, unless its residuals change their sign more often.
 INDEPENDENT_ERRORS = independent_errors(1.0, ERRORS_PER_DISCHARGE["fit"])
-# The search: how many standard deviations of its prior a constant may move, and the logarithm of the distance of q_mobile to
-# its least value, C.
-_REACH_SD, _LOG_DISTANCE_LIMITS = 6.0, (-30.0, 16.0)
+# How many standard deviations of its prior the search may move a constant.
+_REACH_SD = 6.0
 # Where the search for q_mobile starts beside the fit with the constants known before, and how near that may be to its least
 # value, as shares of it.
 _START_EXCESS, _LEAST_EXCESS = 0.02, 1e-4
@@ -226,7 +226,9 @@ class JointFit:
             low, high = bounds[name]
             bounds[name] = max(low, log(dt_s / getattr(start, name))), high
         self.searches = [_thinned(Search.of(record, self.model, PARAMETER_NAMES, self.sd, bounds)) for record in records]
-        self.limits = bounds | {"q_mobile": _LOG_DISTANCE_LIMITS}
+        # the search is over the logarithm of the distance of q_mobile to its least value
+        least_C = min(search.least_q_C for search in self.searches)
+        self.limits = bounds | {"q_mobile": (log(MARGIN * least_C), log(bounds["q_mobile"][1]))}
         self.charges_C = np.array([drawn_charge_C(record) for record in records])
 
     @cached_property
