@@ -143,7 +143,7 @@ def least_squares(prior_q_mobile_C: float | None = None, is_size_known: bool = F
     """Least squares with the constants of the new cell, and what ``calibrate`` expects of a cell in progress of its size."""
     prior = None if prior_q_mobile_C is None else (prior_q_mobile_C, PRIOR_SD_SHARE * prior_q_mobile_C)
     settings = Settings(prior_q_mobile_C=prior)
-    calibrator = settings.calibrator(usual_q_mobile_C=settings.usual_q_mobile_C if is_size_known else None)
+    calibrator = settings.calibrator(size=settings.size if is_size_known else None)
     assert isinstance(calibrator, LeastSquares)
     return calibrator
 

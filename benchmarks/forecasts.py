@@ -55,10 +55,11 @@ FITTED_LAST = 3
 
 FORECAST, UNKNOWN_LOAD = "forecast, life known", "the same, load unknown"
 OWN_FIT = "forecast, life known and fitted"
+OF_SIZE = "forecast, nominal capacity and load known"
 NO_LIFE, NOTHING = "forecast, nothing but the load known", "forecast, nothing known"
 _LONGEST_S = 20_000.0
-#: How a cell is looked at of which nothing is known.
-NEW = Settings(cut_off_V=CUT_OFF_V)
+#: Without prior knowledge of the cell, and with its nominal capacity.
+NEW, NOMINAL = Settings(cut_off_V=CUT_OFF_V), Settings(cut_off_V=CUT_OFF_V, nominal_Ah=2.0)
 
 
 def step_load(rng: np.random.Generator) -> Load:
@@ -151,7 +152,9 @@ def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int) ->
     for n in tqdm(range(1, len(discharges), every), desc=cell, unit="discharge", file=sys.stderr):
         running, last = discharges[n], discharges[n - 1].loaded_part(CUT_OFF_V)
         current_A = float(running.loaded_part(CUT_OFF_V).current_A[-1])
-        knows, end_s = {FORECAST: (NEW, life.after(n)), NO_LIFE: (NEW, None)}, running.eod_time_s(CUT_OFF_V)
+        knows, end_s = {FORECAST: (NEW, life.after(n)), OF_SIZE: (NOMINAL, None), NO_LIFE: (NEW, None)}, running.eod_time_s(
+            CUT_OFF_V
+        )
         said = ends(last, running, knows, partial(_held, constant(current_A, "current")), end_s)
         rows += [{"data": cell, "load": "2 A", "discharge": n + 1} | row for row in said]
     return rows
@@ -180,6 +183,7 @@ def simulated_rows(kind: str, seed: int, fit: CellFit, count: int) -> list[dict[
         own = fit_cell(before[-FITTED_LAST:], CUT_OFF_V)
         knows: dict[str, Known] = {
             FORECAST: (NEW, track_life(before, CUT_OFF_V)),
+            OF_SIZE: (NOMINAL, None),
             NO_LIFE: (NEW, None),
             OWN_FIT: (Settings(cell=own), track_life(before, CUT_OFF_V, own.calibrator())),
         }

@@ -163,8 +163,8 @@ class LeastSquares(Estimator):
     :param q_mobile_bounds_C: bounds of the search, C; the lower bound is raised to the least value that the record allows
     :param r_o_bounds_ohm: bounds of the search, ohm
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before this record, C; ``None``: no prior
-    :param usual_q_mobile_C: usual ``q_mobile`` of cells of this size, new or aged, C: a weak prior that nobody stated. No
-        settled estimate depends on it, and nothing contradicts it; ``None``: all sizes are equally likely
+    :param size: usual ``q_mobile`` of cells of this size, new or aged: a weak prior, on which no settled estimate depends;
+        ``None``: all sizes are equally likely
     :param mismatch_V: expected error of the model, V, as above
     :param voltage_noise_V: standard deviation of the noise of the voltage sensor, V; ``None``: estimated from the record
     :param window_every_s: time between the estimates of :meth:`trace`, s; ``None``: one estimate, at the end
@@ -191,7 +191,7 @@ class LeastSquares(Estimator):
         q_mobile_bounds_C: tuple[float, float] = Q_MOBILE.limits,
         r_o_bounds_ohm: tuple[float, float] = R_O.limits,
         prior_q_mobile_C: tuple[float, float] | None = None,
-        usual_q_mobile_C: float | None = None,
+        size: SizePrior | None = None,
         mismatch_V: float = 0.0,
         voltage_noise_V: float | None = None,
         window_every_s: float | None = None,
@@ -220,9 +220,9 @@ class LeastSquares(Estimator):
             Q_MOBILE.check(prior_q_mobile_C[0])
             if not 0.0 < prior_q_mobile_C[1] < np.inf:
                 raise ValueError(f"prior_q_mobile_C is (mean, sd) with sd > 0, got {prior_q_mobile_C!r}")
-        if usual_q_mobile_C is not None:
-            check_positive("usual_q_mobile_C", usual_q_mobile_C)
-        self.prior_q_mobile_C, self.usual_q_mobile_C = prior_q_mobile_C, usual_q_mobile_C
+        if size is not None:
+            check_positive("size.usual_C", size.usual_C)
+        self.prior_q_mobile_C, self.size = prior_q_mobile_C, size
         self.current_gain_sd = check_gain_sd(current_gain_sd)
         for name, value in (("voltage_noise_V", voltage_noise_V), ("window_every_s", window_every_s)):
             if value is not None and not 0.0 < value < np.inf:
@@ -297,20 +297,20 @@ class LeastSquares(Estimator):
 
     def _fit(self, record: Samples, history: ChargeHistory, previous: Estimate | None = None) -> RecordFit:
         """The best fits with and without the prior, with all that their standard deviations are made of."""
-        prior, noise_V, usual_C = self.prior, self.voltage_noise_V or 0.0, self.usual_q_mobile_C
+        prior, noise_V, size = self.prior, self.voltage_noise_V or 0.0, self.size
         is_open = "q_mobile" in self.parameters
         search = Search.of(record, self.model, self.parameters, prior.nuisance, self.bounds)
         search = search if is_open else search.until_empty()
         starts = prior.starts(search, previous)
         at_start_V = search.residual(dict.fromkeys(prior.nuisance, 0.0) | starts[0])[0]
-        if not noise_V and (prior.nuisance or prior.mismatch_V or usual_C):  # what else is known is weighed against it
+        if not noise_V and (prior.nuisance or prior.mismatch_V or size):  # what else is known is weighed against it
             noise_V = max(white_noise_V(at_start_V), _LEAST_NOISE_V)
         priors = prior.residuals()
         error = prior.error(record, history, starts[0]["q_mobile"], float(at_start_V[0]), noise_V)
         search = replace(search, error=error)
-        if usual_C is not None:
-            priors.append(SizePrior(usual_C))
-            starts = [*starts, *search.starts([usual_C])[0]]
+        if size is not None:
+            priors.append(size)
+            starts = [*starts, *search.starts([size.usual_C])[0]]
         fit = search.best(starts, priors)
         n = len(fit.residual_V)
         variance = 1.0 if noise_V else square(fit.residual_V) / (n - len(self.parameters))
@@ -318,7 +318,7 @@ class LeastSquares(Estimator):
             # a model that is exact, or of cells of this kind, has no other knee
             knee_C = knee_sd_C(record, _model_V(record, fit), self.model.cell.VEOD) if error.drift_V else 0.0
             fit = replace(fit, spread=search.spread(fit, priors, variance), knee_sd_C=knee_C)
-        # a settled estimate rests neither on a usual size, which nobody stated, nor on what goes together along a path
+        # a settled estimate rests neither on a usual size nor on what goes together along a path
         loose = np.pad(np.diag([1.0 / sd for sd in prior.nuisance.values()]), ((0, 0), (len(self.parameters), 0)))
         without_prior = replace(fit, jacobian=np.vstack([fit.jacobian[:n], loose]))
         variance += prior.more_variance(record, fit, error, noise_V)

@@ -101,17 +101,20 @@ class Prior:
 @dataclass(frozen=True)
 class SizePrior:
     """
-    What cells of one size hold, new or worn, as one more residual. Far from ``usual_C`` the density of the logarithm of
-    ``q_mobile`` falls as one over the distance: the size is likely, and none is ruled out.
+    What cells of one size hold, new or aged, as one more residual of the logarithm of ``q_mobile``. Of a stated size it is
+    normal. Of one that nobody stated its density falls as one over the distance: the size is likely, and none is ruled out.
     """
 
     usual_C: float
+    is_stated: bool = False
 
     def residual(self, values: Mapping[str, float]) -> tuple[FloatArray, dict[str, FloatArray]]:
         """The residual, and its derivatives by unknown."""
         distance = log(values["q_mobile"] / self.usual_C) / SIZE_WIDTH
-        residual = copysign(sqrt(log1p(distance**2)), distance)
-        slope = distance / (1.0 + distance**2) / residual if residual else 1.0
+        residual, slope = distance, 1.0
+        if not self.is_stated and distance:
+            residual = copysign(sqrt(log1p(distance**2)), distance)
+            slope = distance / (1.0 + distance**2) / residual
         return np.array([residual]), {"q_mobile": np.array([slope / (SIZE_WIDTH * values["q_mobile"])])}
 
 

@@ -202,7 +202,7 @@ def cut(discharge: Discharge, settings: Settings) -> LoadedPart:
         soc, sd_soc = check_initial_soc(settings.initial_soc)
         start = Start(soc, sd_soc)
     loaded = LoadedPart(
-        settings=settings.expecting(mean_current_A(record)),
+        settings=settings.expecting(record.current_A),
         discharge=discharge,
         part=part,
         record=record,
@@ -223,7 +223,7 @@ def estimate(loaded: LoadedPart, fixes_constants: bool = False) -> Fit:
     """
     settings, record, start, cell = loaded.settings, loaded.record, loaded.start, loaded.cell
     resolved, thermal = settings.resolved, settings.resolved.thermal
-    calibrator = settings.calibrator(cell, start, settings.usual_q_mobile_C if loaded.in_progress else None)
+    calibrator = settings.calibrator(cell, start, settings.size if loaded.in_progress else None)
     if isinstance(calibrator, PolicyEstimator):
         cell, thermal = calibrator.cell, False
     model = RecordModel(cell, thermal, initial_soc=start.soc)
@@ -394,7 +394,7 @@ def _notes(loaded: LoadedPart, fit: Fit, load_A: float) -> Iterator[str]:
     yield from (str(each) for each in settings.other_load(load_A) if each not in fit.estimate.findings)
     if float(loaded.discharge.time_s[-1]) > end_s:
         yield f"What was recorded after the last sample under load, at {end_s:.0f} s, is left out."
-    if settings.usual_q_mobile_C is not None and settings.nominal_Ah is None and settings.method != "policy":
+    if settings.size is not None and not settings.size.is_stated and settings.method != "policy":
         yield "A cell of some 2 Ah is expected: of another one give the nominal capacity, the life, q_max or constants."
     if rmse_V > settings.resolved.mismatch_V:
         text = f"The model misses the voltage by {1e3 * rmse_V:.0f} mV (RMSE), more than mismatch_V."

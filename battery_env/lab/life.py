@@ -27,7 +27,7 @@ from battery_env.estimators.least_squares import Alternative, LeastSquares, Reco
 from battery_env.estimators.resistance import measured_resistance_ohm
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
-from battery_env.records import VARIED_SHARE, DischargeStart, drawn_charge_C, integrate_load, mean_current_A
+from battery_env.records import VARIED_SHARE, DischargeStart, drawn_charge_C, integrate_load, load_range_A, mean_current_A
 from battery_env.records.discharge import Discharge
 
 #: Priors of a life, as shares of q_mobile: the step from one discharge to the next and the independent error of an estimate
@@ -148,7 +148,7 @@ class Life:
         """
         is_current = load is None or isinstance(load, Real) or (isinstance(load, Load) and load.unit == "current")
         future_A = load.value.tolist() if isinstance(load, Load) else [float(load)] if isinstance(load, Real) else []
-        so_far_A = np.quantile(running.current_A[running.time_s > running.load_on_time_s], [0.05, 0.95])
+        so_far_A = load_range_A(running.current_A[running.time_s > running.load_on_time_s])
         currents_A = np.array([*so_far_A, *(future_A if is_current else [])])
         ratios = np.maximum(currents_A, 0.0) / self._usual_A
         is_usual = np.ptp([1.0, *ratios]) <= VARIED_SHARE * max(1.0, *ratios)

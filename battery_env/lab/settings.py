@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
 
+from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive, with_option_hints
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
@@ -21,11 +22,11 @@ from battery_env.estimates.findings import Finding, Reason
 from battery_env.estimators.cell_fit import RATE_PRIOR_SD, SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.least_squares import LeastSquares
-from battery_env.estimators.search import SIZE_WIDTH
+from battery_env.estimators.search import SIZE_WIDTH, SizePrior
 from battery_env.estimators.verdict import PRIOR_LIMIT_SD
 from battery_env.parameters import Q_MOBILE
 from battery_env.policies.policy_estimator import PolicyEstimator
-from battery_env.records import CUT_OFF_V, DischargeStart
+from battery_env.records import CUT_OFF_V, DischargeStart, load_range_A
 from battery_env.records.samples import check_cut_off
 
 Method = Literal["least-squares", "policy"]
@@ -143,12 +144,15 @@ class Settings:
         """Return settings with some changes; options that nobody stated follow a changed cell."""
         return replace(self, **changes)
 
-    def expecting(self, current_A: float) -> Settings:
+    def expecting(self, current_A: FloatArray) -> Settings:
         """
         Return settings with the expected model error at the age of the prior, if no error is stated and the constants were
-        fitted to this mean current.
+        fitted to these currents: at others the constants may be wrong by more than the fit left.
         """
-        if self.fit is None or self.mismatch_V is not None or self.prior_q_mobile_C is None or self.other_load(current_A):
+        if self.fit is None or self.mismatch_V is not None or self.prior_q_mobile_C is None or self.fit.currents_A is None:
+            return self
+        (low_A, high_A), (least_A, most_A) = load_range_A(current_A), self.fit.currents_A
+        if not least_A / _SAME_LOAD <= low_A <= high_A <= most_A * _SAME_LOAD:
             return self
         return replace(self, mismatch_V=self.fit.error_at_V(self.prior_q_mobile_C[0]))
 
@@ -200,15 +204,15 @@ class Settings:
         return float(np.clip(Q_MOBILE_PER_CAPACITY * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
 
     @property
-    def usual_q_mobile_C(self) -> float | None:
+    def size(self) -> SizePrior | None:
         """Usual ``q_mobile`` of cells of this size, new or aged; ``None`` with a prior or a cell, which determine more."""
         is_known = self.prior_q_mobile_C is not None or self.cell is not None
-        return None if is_known else _USUAL_SHARE * self._new_q_mobile_C
+        return None if is_known else SizePrior(_USUAL_SHARE * self._new_q_mobile_C, self.nominal_Ah is not None)
 
     @property
     def constants_in_progress(self) -> CellParameters:
         """Constants for a discharge in progress: of a cell of the nominal capacity, without a prior or a cell."""
-        if self.usual_q_mobile_C is None or self.method == "policy":
+        if self.size is None or self.method == "policy":
             return self.constants
         return new_cell_of(self._new_q_mobile_C)
 
@@ -242,15 +246,15 @@ class Settings:
         return self.cell is not None and high_A <= low_A * _SAME_LOAD and not self.other_load(current_A)
 
     def calibrator(
-        self, cell: CellParameters | None = None, start: Start | None = None, usual_q_mobile_C: float | None = None
+        self, cell: CellParameters | None = None, start: Start | None = None, size: SizePrior | None = None
     ) -> LeastSquares | PolicyEstimator:
         """
         Build the calibrator, which refuses options that it cannot use.
 
         :param cell: constants of the model at the temperature of a discharge; ``None``: those of the settings
         :param start: how the discharge starts; ``None``: as the settings say
-        :param usual_q_mobile_C: usual ``q_mobile`` of cells of this size, for least squares of a record in progress;
-            ``None``: all sizes are equally likely
+        :param size: usual ``q_mobile`` of cells of this size, for least squares of a record in progress; ``None``: all sizes
+            are equally likely
         :raises ValueError: for an option out of range
         """
         if self.method == "policy":
@@ -270,9 +274,7 @@ class Settings:
         # free constants of any kind of cell explain as much of the model error as q_mobile and r_o absorb
         is_explained = rates_sd is RATE_PRIOR_SD
         mismatch_V = resolved.mismatch_V / UNFITTED_ERROR_RATIO if is_explained else resolved.mismatch_V
-        return LeastSquares(
-            mismatch_V=mismatch_V, nuisance=rates_sd, path=self.path, usual_q_mobile_C=usual_q_mobile_C, **common
-        )
+        return LeastSquares(mismatch_V=mismatch_V, nuisance=rates_sd, path=self.path, size=size, **common)
 
     def _rates_sd(self) -> Mapping[str, float]:
         """

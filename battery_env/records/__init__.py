@@ -15,6 +15,7 @@ from battery_env.records.load import LoadSpan as LoadSpan
 from battery_env.records.load import expected_current as expected_current
 from battery_env.records.load import integrate_load as integrate_load
 from battery_env.records.load import is_load as is_load
+from battery_env.records.load import load_range_A as load_range_A
 from battery_env.records.load import load_span as load_span
 from battery_env.records.load import resample_current as resample_current
 from battery_env.records.load import switches as switches

@@ -125,6 +125,12 @@ def resample_current(time_s: FloatArray, current_A: FloatArray, dt_s: float, n_s
     return np.diff(integrate_load(time_s, current_A, grid_s)) / dt_s
 
 
+def load_range_A(current_A: FloatArray) -> tuple[float, float]:
+    """Return the range of a load without its few extremes: the 5 % and the 95 % quantile of the current."""
+    low_A, high_A = np.quantile(current_A, [0.05, 0.95]).tolist()
+    return low_A, high_A
+
+
 class ExpectedCurrent(NamedTuple):
     """The current to expect after the end of a record, A."""
 
@@ -144,8 +150,8 @@ def expected_current(time_s: ArrayLike, current_A: ArrayLike) -> ExpectedCurrent
     if not loaded.any() or not (loaded[-1] or load_count > 1):
         return ExpectedCurrent(0.0, False, 0.0)
     first = int(loaded.argmax())
-    low, high = np.quantile(current[first:], [0.05, 0.95])
-    if first == len(time) - 1 or high - low <= VARIED_SHARE * high:
+    low_A, high_A = load_range_A(current[first:])
+    if first == len(time) - 1 or high_A - low_A <= VARIED_SHARE * high_A:
         return ExpectedCurrent(float(current[-1]), False, 0.0)
     ends_s = np.linspace(time[first], time[-1], 5)
     quarters_A = np.diff(integrate_load(time, current, ends_s)) / np.diff(ends_s)

@@ -19,6 +19,7 @@ from battery_env.estimators.search import JointSearch
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
+from battery_env.loads import RandomPiecewise
 from battery_env.loads import constant as constant_load
 from battery_env.records import ChargeBefore, DischargeStart
 from battery_env.records.discharge import Discharge, load_nasa_discharges
@@ -56,6 +57,19 @@ def fit(simulated):
 def b0005_fit():
     discharges = load_nasa_discharges("B0005")
     return fit_cell([discharges[0], discharges[84], discharges[-1]])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 4, 7, 11])
+def test_under_a_changing_load_a_nominal_capacity_keeps_the_estimate_of_another_cell_near(b0005_fit, seed):
+    """Constants of a new cell let such a record run off to several times the true charge."""
+    rng = np.random.default_rng(seed)
+    load = RandomPiecewise((0.5, 4.0), unit="current")(rng)
+    whole = simulate(load, 6100.0, 0.15, load_unit="current", thermal=True, cell=b0005_fit.cell, cut_off_V=2.6)
+    voltage_V = whole.voltage_V + 0.005 * rng.standard_normal(len(whole.time_s))
+    record = Discharge(whole.time_s, voltage_V, whole.current_A, starts_at_rest=True).until(0.75 * whole.reached_s(2.7))
+    found = calibrate(record, nominal_Ah=2.0)
+    assert abs(found.q_mobile_C / 6100.0 - 1.0) < 0.5 and not found.settled
+    assert abs(found.q_mobile_C - 6100.0) < 2.0 * found.sd_q_mobile_C
 
 
 def test_a_fit_tells_how_much_the_cell_holds_before_its_knee_does(b0005_fit, monkeypatch):
@@ -230,10 +244,11 @@ class TestRealCells:
 
     def test_an_error_is_expected_at_the_age_of_a_prior_and_at_the_load_of_the_fit(self, b0005_fit):
         settings, q_C = Settings(cell=b0005_fit), b0005_fit.cell.q_mobile
-        of_fit_A, _ = b0005_fit.currents_A
+        of_fit_A = np.full(60, b0005_fit.currents_A[0])
         known = dataclasses.replace(settings, prior_q_mobile_C=(q_C, 50.0))
         assert known.expecting(of_fit_A).resolved.mismatch_V == b0005_fit.error_at_V(q_C) <= b0005_fit.mismatch_V
-        for other in (settings.expecting(of_fit_A), known.expecting(2.0 * of_fit_A)):
+        pulses_A = of_fit_A * np.tile([0.5, 1.5], 30)
+        for other in (settings.expecting(of_fit_A), known.expecting(2.0 * of_fit_A), known.expecting(pulses_A)):
             assert other.resolved.mismatch_V == b0005_fit.mismatch_V
         assert dataclasses.replace(known, mismatch_V=0.03).expecting(of_fit_A).resolved.mismatch_V == 0.03
 

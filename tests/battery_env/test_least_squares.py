@@ -9,7 +9,7 @@ from battery_env import Discharge, LeastSquares, SensorErrors, cramer_rao_bound,
 from battery_env.electrochemistry import NEW_CELL, Trajectory, initial_state, simulate
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.error import ErrorModel
-from battery_env.estimators.search import Prior, Search
+from battery_env.estimators.search import Prior, Search, SizePrior
 from battery_env.records import Samples
 from tests.sweeps import sweep
 
@@ -264,7 +264,7 @@ class TestBadInput:
             ({"r_o_bounds_ohm": (0.2, 0.1)}, "bounds of r_o must be"),
             ({"r_o_bounds_ohm": (0.0, 80.0)}, "Milliohms"),
             ({"prior_q_mobile_C": (6000.0, 0.0)}, "sd > 0"),
-            ({"usual_q_mobile_C": 0.0}, "usual_q_mobile_C must be a positive"),
+            ({"size": SizePrior(0.0)}, "size.usual_C must be a positive"),
             ({"prior_q_mobile_C": (1.9, 0.1)}, "Ampere-hours|mean within 100 .. 1e\\+07"),
             ({"prior_q_mobile_C": (6000.0, 60.0), "parameters": ["r_o"]}, "needs 'q_mobile'"),
             ({"mismatch_V": -0.05}, "mismatch_V must be .*at least 0.*, got -0.05"),
@@ -296,6 +296,17 @@ class TestBadInput:
             LeastSquares(q_mobile_bounds_C=(100.0, 4000.0)).estimate(discharged())
         with pytest.raises(ValueError, match="q_mobile = 100 C is empty at the start"):
             LeastSquares(["r_o"], cell=NEW_CELL.replace(q_mobile=100.0)).estimate(discharged(load=30.0, load_unit="current"))
+
+
+@pytest.mark.parametrize("is_stated", [False, True])
+@pytest.mark.parametrize("ratio", [0.4, 0.999999, 1.0, 1.2, 5.0])
+def test_a_stated_size_rules_out_far_ones_and_the_derivative_of_its_residual_is_right(ratio, is_stated):
+    size = SizePrior(6000.0, is_stated)
+    at = [float(size.residual({"q_mobile": 6000.0 * ratio * factor})[0][0]) for factor in (1.0 - 1e-6, 1.0, 1.0 + 1e-6)]
+    (slope,) = size.residual({"q_mobile": 6000.0 * ratio})[1]["q_mobile"]
+    assert slope * 6000.0 * ratio == pytest.approx((at[2] - at[0]) / 2e-6, rel=1e-4)
+    # 2.5 standard deviations of a stated size contradict it; no number of them an unstated one
+    assert abs(at[1]) == pytest.approx(abs(np.log(ratio)) / 0.2) if is_stated else abs(at[1]) < 2.1
 
 
 def test_a_cell_whose_charges_meet_fast_is_found():
