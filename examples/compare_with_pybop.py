@@ -1,5 +1,5 @@
 """
-The charge and the resistance of a real cell by least squares and PyBOP on the same record.
+The charge and the resistance of a real cell by ``calibrate`` and PyBOP on the same record.
 
 PyBOP fits an equivalent circuit of PyBaMM (a resistor and an RC pair) on the open-circuit voltage of this package's model, so
 that its capacity is what q_max is here: the charge between full and empty. It needs ``pip install '.[pybop]'``.
@@ -11,9 +11,8 @@ import numpy as np
 import pybamm
 import pybop
 
-from battery_env import LeastSquares, initial_state, load_nasa_discharges
+from battery_env import calibrate, initial_state, load_nasa_discharges
 from battery_env.electrochemistry import voltage
-from battery_env.records.model import RecordModel
 
 record = load_nasa_discharges("B0005")[99].loaded_part(cut_off_V=2.7)
 
@@ -27,12 +26,11 @@ def show(name: str, charge_Ah: float, resistance_ohm: float, residual_V: np.ndar
     print(f"{name:<16}{charge_Ah:12.3f}{resistance_ohm:18.3f}{rmse_mV:11.1f}{took_s:10.3f}")
 
 
-calibrator = LeastSquares(thermal=True, mismatch_V=0.05)
-calibrator.estimate(record.until(600.0))  # compiles
+calibrate(record.until(600.0))  # compiles
 since_s = time.perf_counter()
-estimate = calibrator.estimate(record)
-residual_V = RecordModel(thermal=True).voltage(record, estimate) - record.voltage_V
-show("least squares", estimate.q_mobile / 3600.0, estimate.r_o, residual_V, since_s)
+cell = calibrate(record)
+residual_V = cell.forecast.at_samples_V - record.voltage_V
+show("least squares", cell.q_mobile_C / 3600.0, cell.resistance_10s_ohm, residual_V, since_s)
 
 # The open-circuit voltage of the model over the state of charge. Where it is empty it has none.
 soc = np.linspace(0.0, 1.0, 401)
