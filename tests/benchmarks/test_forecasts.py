@@ -18,10 +18,10 @@ def test_the_study_writes_its_tables(monkeypatch, tmp_path, capsys):
         monkeypatch.setattr(forecasts, name, value)
     forecasts.main(["--cells", "B0005", "--simulated", "1", "--out", str(tmp_path)])
     rows = pd.read_csv(tmp_path / "discharges.csv")
-    assert len(rows) == (1 + len(forecasts.LOADS)) * (len(forecasts.BASELINES) + 4) + len(forecasts.LOADS)
+    assert len(rows) == (1 + len(forecasts.LOADS)) * (len(forecasts.BASELINES) + 5) + len(forecasts.LOADS)
     error = rows.set_index(["load", "method"])["error_percent"].abs()
     # at the load of the last one all that carry something on are right, and at another one a clock is wrong
-    assert error["2 A"].drop([forecasts.NO_LIFE, forecasts.NOTHING]).max() < 5.0
+    assert error["2 A"].drop([forecasts.OF_SIZE, forecasts.NO_LIFE, forecasts.NOTHING]).max() < 5.0
     assert error[:, forecasts.FORECAST].max() < 10.0 < error["1 A, then 4 A", "as long as the last"]
     assert "| B0005" in capsys.readouterr().out and (tmp_path / "summary.md").stat().st_size > 0
 
