@@ -184,9 +184,9 @@ def test_no_private_name_leaves_its_module():
                 assert not any(alias.name.startswith("_") for alias in node.names), f"{path}, line {node.lineno}"
 
 
-#: What there was at the last release. Until the next one, which writes its own numbers here, there may be a share of AIR more.
+#: What there was at the last release, or before where that was less. Until the next one there may be a share of AIR more.
 AT_RELEASE = {
-    "battery_env": {"lines": 18_328, "numbers at the top of modules": 192, "starred calls": 44},
+    "battery_env": {"lines": 18_328, "numbers at the top of modules": 181, "starred calls": 42},
     # for who puts a policy of a wrapped environment onto a plant, who clips gradients by hooks in compiled trainings, whose
     # instrument is out of its range, and who compares two loops: each met a silent wrong
     "sb3_lac": {"lines": 7_391, "numbers at the top of modules": 22, "starred calls": 39},
