@@ -240,6 +240,11 @@ class LeastSquares(Estimator):
         """
         return self.estimate_of(self.fit(record))
 
+    @property
+    def mismatch_V(self) -> float:
+        """Expected error of the model, V, as a forecast takes it."""
+        return self.prior.mismatch_V
+
     def fit(self, record: Record) -> RecordFit:
         """The search of :meth:`estimate`, which also says what other cells a record leaves open."""
         return self._fit(self._samples(record), self._history(record))
