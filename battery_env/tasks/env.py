@@ -54,7 +54,7 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
     A calibration task for one cell. The reward is minus the cost, and ``info`` holds the cost and the
     :meth:`~battery_env.tasks.base.CalibrationTask.report`. ``help(env.task)`` describes observations, actions, costs and
-        options.
+    options.
 
     :param task: the class of the task, or its path, as ``"module:name"``
     :param render_mode: ``"rgb_array"`` or ``None``
