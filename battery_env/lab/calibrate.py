@@ -305,7 +305,13 @@ def calibration_of(loaded: LoadedPart, fit: Fit, end: Forecast | None) -> Calibr
         measured_resistance_10s_ohm=measured_resistance_ohm(loaded.part, loaded.part.starts_at_rest),
         r_o_ohm=result.r_o,
         sd_r_o_ohm=result.sd_r_o,
-        **{name: value for name, value in vars(result).items() if name in Calibration.__annotations__},
+        resistance_10s_ohm=result.resistance_10s_ohm,
+        sd_resistance_10s_ohm=result.sd_resistance_10s_ohm,
+        settled=result.settled,
+        settled_q_mobile=result.settled_q_mobile,
+        settled_resistance_10s=result.settled_resistance_10s,
+        settled_r_o=result.settled_r_o,
+        findings=result.findings,
         initial_soc=loaded.start.soc,
         sd_initial_soc=loaded.start.sd_soc,
         samples=len(loaded.part.time_s),
@@ -366,7 +372,7 @@ def _with_resistance_of(free: Estimate, fixed: Estimate) -> Estimate:
         resistance_10s_ohm=free.resistance_10s_ohm,
         sd_resistance_10s_ohm=free.sd_resistance_10s_ohm,
         settled_resistance_10s=free.settled_resistance_10s,
-        settled=True,  # as both numbers are
+        settled=True,  # if both numbers are: Estimate sees to it
         findings=tuple(findings),
     )
 

@@ -81,7 +81,7 @@ class Settings:
     :param nominal_Ah: nominal capacity for the state of health, Ah; ``None``: the charge that ``cell`` with its own
         ``q_mobile`` and ``r_o`` gives from full at the current of the discharge, or unknown without a ``cell``. Without other
         prior knowledge the nominal capacity is also the expected size of a cell in progress, instead of a new 18650. No
-        estimate of another size than such cells have, new or worn, is settled
+        estimate of another size than such cells have, new or aged, is settled
     :param cell: constants of the model, or a result of ``fit_cell``: more than a quarter beyond the loads of the fit no
         estimate is settled, and the nominal capacity is unknown. Or a result of ``fit_life``, the path of aging cells of this
         kind, for least squares. ``None``: the constants of a new 18650
@@ -204,10 +204,14 @@ class Settings:
         return float(np.clip(Q_MOBILE_PER_CAPACITY * 3600.0 * self.nominal_Ah, *Q_MOBILE.limits))
 
     @property
+    def _usual_size(self) -> SizePrior:
+        return SizePrior(_USUAL_SHARE * self._new_q_mobile_C, is_stated=self.nominal_Ah is not None)
+
+    @property
     def size(self) -> SizePrior | None:
         """Usual ``q_mobile`` of cells of this size, new or aged; ``None`` with a prior or a cell, which determine more."""
         is_known = self.prior_q_mobile_C is not None or self.cell is not None
-        return None if is_known else SizePrior(_USUAL_SHARE * self._new_q_mobile_C, self.nominal_Ah is not None)
+        return None if is_known else self._usual_size
 
     @property
     def constants_in_progress(self) -> CellParameters:
@@ -218,12 +222,12 @@ class Settings:
 
     def other_size(self, estimate: Estimate, drawn_C: float) -> tuple[Finding, ...]:
         """
-        Why an estimate is not of a cell of the nominal capacity, new or worn; empty if it may be, or none is stated. The cell
-        holds no less than was drawn, and no more than ``q_mobile``, and of that what is nearest is compared.
+        Return why an estimate is not of a cell of the nominal capacity, new or aged; empty if it may be, or without a nominal
+        capacity. The cell holds at least the charge drawn and at most ``q_mobile``: the nearest charge between is compared.
         """
         if self.nominal_Ah is None:
             return ()
-        usual_C = _USUAL_SHARE * self._new_q_mobile_C
+        usual_C = self._usual_size.usual_C
         nearest_C = float(np.clip(usual_C, Q_MOBILE_PER_CAPACITY * drawn_C, estimate.q_mobile))
         ratio = exp(PRIOR_LIMIT_SD * hypot(SIZE_WIDTH, estimate.sd_q_mobile / estimate.q_mobile))
         if not abs(log(nearest_C / usual_C)) > log(ratio):
