@@ -26,7 +26,7 @@ from battery_env.estimates.findings import Doubt, Reason
 from battery_env.estimators.diagnosis.evidence import Evidence, evidence_of
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
 from battery_env.estimators.resistance import measured_resistance_ohm
-from battery_env.lab.forecast import Forecast, forecast
+from battery_env.lab.forecast import Forecast, ModelError, forecast
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import map_usable, read_recordings
 from battery_env.lab.readers.testers import Tester, find_tester
@@ -259,8 +259,17 @@ def _warn(notes: Iterable[str]) -> None:
         warnings.warn(note, stacklevel=5)
 
 
-def predict(loaded: LoadedPart, fit: Fit, load: LoadToCome | None = None, samples: int = 1000) -> Forecast:
-    """Predict the end of a discharge from the end of its record on, under a load (``None``: as so far)."""
+def predict(
+    loaded: LoadedPart,
+    fit: Fit,
+    load: LoadToCome | None = None,
+    samples: int = 1000,
+    model_error: ModelError | None = None,
+) -> Forecast:
+    """
+    Predict the end of a discharge from the end of its record on, under a load (``None``: as so far), with what the model
+    missed over an earlier discharge, and will miss again.
+    """
     if _is_below_all_sizes(loaded):
         raise ValueError(Reason.BELOW_ALL_SIZES.text)
     settings, cut_off_V, result = loaded.settings, loaded.settings.resolved.cut_off_V, fit.estimate
@@ -275,6 +284,7 @@ def predict(loaded: LoadedPart, fit: Fit, load: LoadToCome | None = None, sample
         mismatch_V=settings.resolved.mismatch_V,
         nominal_Ah=settings.nominal_Ah,
         samples=samples,
+        model_error=model_error,
     )
     # independent of the draws of the forecast, whose seed is 0
     gains = 1.0 + settings.current_gain_sd * np.random.default_rng([0, 1]).standard_normal(samples)

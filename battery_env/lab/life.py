@@ -25,6 +25,7 @@ from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, r
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import Alternative, LeastSquares, RecordFit
 from battery_env.estimators.resistance import measured_resistance_ohm
+from battery_env.lab.forecast import ModelError
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.records import VARIED_SHARE, DischargeStart, drawn_charge_C, integrate_load, load_range_A, mean_current_A
@@ -35,7 +36,7 @@ from battery_env.records.discharge import Discharge
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
 _COLUMNS = """
     cycle q_mobile_C sd_q_mobile_C resistance_10s_ohm sd_resistance_10s_ohm settled_resistance_10s measured_resistance_10s_ohm
-    r_o_ohm settled findings reason valid capacity_Ah mean_current_A lasted_share
+    r_o_ohm settled findings reason valid capacity_Ah mean_current_A least_current_A most_current_A lasted_share model_error
 """.split()
 # The number of simulated lives, and of discharges ahead.
 _LIVES, _MOST = 2000, 2000
@@ -52,9 +53,11 @@ class Life:
     :param table: one row per discharge: ``cycle`` (its number, or its position), ``q_mobile_C``, ``sd_q_mobile_C``,
         ``resistance_10s_ohm`` and ``sd_resistance_10s_ohm`` (after ten seconds, of a fit that also estimates constants),
         ``settled_resistance_10s``, ``measured_resistance_10s_ohm``, ``r_o_ohm``, ``settled``, ``findings``, ``reason``,
-        ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off), ``mean_current_A``, ``lasted_share`` (its
-        duration, as a share of the model's at this ``q_mobile``; NaN if it was cut short), and the prediction from the earlier
-        discharges, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN for the first)
+        ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off), ``mean_current_A``, ``least_current_A`` and
+        ``most_current_A`` (without a few extremes), ``lasted_share`` (its duration, as a share of the model's at this
+        ``q_mobile``; NaN if it was cut short), ``model_error`` (a :class:`~battery_env.lab.forecast.ModelError`; ``None`` if
+        it was cut short), and the prediction from the earlier discharges, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN
+        for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of the error that an estimate does not share with the others, as such a share
     :param drift_share: mean step, as such a share
@@ -82,25 +85,47 @@ class Life:
     def prior_q_mobile_C(self) -> tuple[float, float]:
         """
         Mean and standard deviation of ``q_mobile`` in the next discharge, C: a prior for its calibration. The prior is for
-        the load of the life, because there the shared error of all estimates cancels from the end. At the ``q_mobile`` of a
-        whole discharge the model ends a little early or late, as in the discharge before: the mean corrects for this error.
+        the load of the last discharge, because there the shared error of all estimates cancels from the end. At the
+        ``q_mobile`` of a whole discharge the model ends a little early or late, as in the discharge before: the mean corrects
+        for this error.
         """
-        return self._prior_C(1)
+        last = self.table[self.table["valid"]].iloc[-1]
+        return self._prior_C(1, last[["least_current_A", "most_current_A"]].to_numpy(dtype=np.float64))
 
-    def _prior_C(self, count: int, other_A: float | None = None) -> tuple[float, float]:
-        """Return the prior so many discharges later, at the load of the life or at another load, A; NaN: at any load."""
-        mean_C, sd_C = self.later_q_mobile_C(count)
-        if other_A is not None:
-            return mean_C, hypot(sd_C, mean_C * UNFITTED_ERROR_RATIO * hypot(self.sd_share, self._open_share(other_A)))
-        complete = self.table[self.table["valid"] & self.table["lasted_share"].notna()]
-        lasted = float(complete["lasted_share"].iloc[-1]) if len(complete) else 1.0
+    def _prior_C(self, count: int, currents_A: FloatArray) -> tuple[float, float]:
+        """Return the prior so many discharges later at these currents, A; NaN: at any."""
+        valid = self.table["valid"].to_numpy(dtype=np.bool_)
+        mean_A, alike = self.table["mean_current_A"], self._alike(currents_A)
+        if not alike.any():
+            mean_C, sd_C = self.later_q_mobile_C(count)
+            return mean_C, hypot(sd_C, mean_C * self._doubt_share(currents_A, float(mean_A[valid].iloc[-1])))
+        life, other = self, valid & ~alike
+        if other.any():
+            # the walk at these currents, of which the estimates at others tell less
+            doubt_share = self._doubt_share(mean_A[other].to_numpy(), float(mean_A[alike].iloc[-1]))
+            life = life_of(self.table, np.where(other, doubt_share, 0.0))
+        mean_C, sd_C = life.later_q_mobile_C(count)
+        lasted_share = self.table["lasted_share"][alike].dropna()
+        lasted = float(lasted_share.iloc[-1]) if len(lasted_share) else 1.0
         return lasted * mean_C, lasted * sd_C
 
-    def _open_share(self, load_A: float) -> float:
-        """Return the relative uncertainty, by the constants, of the ratio of charges at a load and at that of the life."""
+    def _alike(self, currents_A: FloatArray) -> BoolArray:
+        """Return which valid discharges have all of their currents within 5 % of all of these, A; none of NaN."""
+        least_A = np.minimum(self.table["least_current_A"], currents_A.min())
+        most_A = np.maximum(self.table["most_current_A"], currents_A.max())
+        return np.asarray(self.table["valid"] & (most_A - least_A <= VARIED_SHARE * most_A), dtype=np.bool_)
+
+    def _doubt_share(self, currents_A: FloatArray, usual_A: float) -> float:
+        """Return how far the charges at these currents and at a usual one may be from one another, by the constants."""
+        ratios = np.maximum(currents_A, 0.0) / usual_A
+        other_A = float(currents_A[np.argmax(np.maximum(ratios, 1.0 / np.maximum(ratios, VARIED_SHARE)))])
+        return UNFITTED_ERROR_RATIO * hypot(self.sd_share, self._open_share(other_A, usual_A))
+
+    def _open_share(self, load_A: float, usual_A: float) -> float:
+        """Return the relative uncertainty, by the constants, of the ratio of charges at two loads, A."""
         if not load_A > 0.0 or not self.alternatives:
             return 0.0
-        loads = [constant(each_A, "current") for each_A in (load_A, self._usual_A)]
+        loads = [constant(each_A, "current") for each_A in (load_A, usual_A)]
         capacity_Ah = np.array(
             [
                 [float(each.model.capacity_Ah([load], self.cut_off_V, each.q_mobile, each.r_o)[0]) for load in loads]
@@ -111,10 +136,6 @@ class Life:
         # each direction on both sides; at most the whole charge
         difference = (share[1:] - share[0]) / np.maximum(share[1:], share[0])
         return sqrt(0.5 * float(np.nansum(difference**2)))
-
-    @property
-    def _usual_A(self) -> float:
-        return float(self.table["mean_current_A"][self.table["valid"]].iloc[-1])
 
     @property
     def next_q_mobile_C(self) -> tuple[float, float]:
@@ -130,7 +151,7 @@ class Life:
     @property
     def prior_at_other_loads_C(self) -> tuple[float, float]:
         """The same for a load that is not that of the life: the error that all estimates share counts too, in full."""
-        return self._prior_C(1, nan)
+        return self._prior_C(1, np.array([nan]))
 
     def discharges_until(self, cycle: int | None) -> int:
         """Return how many discharges after the last one of the life a discharge is, by its number; 1 without numbers."""
@@ -139,22 +160,22 @@ class Life:
     def prior_for(self, running: Discharge, load: LoadToCome | None = None) -> tuple[float, float]:
         """
         The prior that suits a discharge in progress: :attr:`prior_q_mobile_C` where all currents, so far and to come, lie
-        within 5 % of those of the life, and :attr:`prior_at_other_loads_C` anywhere else. Where its number says that it is not
-        the next one after the life, it is as unsure as the fade in between.
+        within 5 % of those of a discharge of the life, and :attr:`prior_at_other_loads_C` anywhere else. Where its number says
+        that it is not the next one after the life, it is as unsure as the fade in between.
 
         :param running: the discharge in progress
         :param load: to come, as :func:`battery_env.forecast` takes it; ``None``: as so far
         :return: mean and standard deviation of ``q_mobile``, C
         """
-        is_current = load is None or isinstance(load, Real) or (isinstance(load, Load) and load.unit == "current")
-        future_A = load.value.tolist() if isinstance(load, Load) else [float(load)] if isinstance(load, Real) else []
-        so_far_A = load_range_A(running.current_A[running.time_s > running.load_on_time_s])
-        currents_A = np.array([*so_far_A, *(future_A if is_current else [])])
-        ratios = np.maximum(currents_A, 0.0) / self._usual_A
-        is_usual = np.ptp([1.0, *ratios]) <= VARIED_SHARE * max(1.0, *ratios)
-        farthest = int(np.argmax(np.maximum(ratios, 1.0 / np.maximum(ratios, VARIED_SHARE))))
-        other_A = None if is_current and is_usual else float(currents_A[farthest])
-        return self._prior_C(self.discharges_until(running.meta.get("cycle")), other_A)
+        return self._prior_C(self.discharges_until(running.meta.get("cycle")), _currents_A(running, load))
+
+    def model_error_for(self, running: Discharge, load: LoadToCome | None = None) -> ModelError | None:
+        """
+        What the model missed over the last discharge at the load of one in progress, and will miss again; ``None``: there is
+        no such discharge.
+        """
+        errors = self.table["model_error"][self._alike(_currents_A(running, load))].dropna()
+        return errors.iloc[-1] if len(errors) else None
 
     def after(self, count: int) -> Life:
         """
@@ -279,6 +300,16 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, fixed: LeastSquare
     return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=alternatives)
 
 
+def _currents_A(running: Discharge, load: LoadToCome | None) -> FloatArray:
+    """Return the range of the currents so far, and all currents to come, A; NaN if these are unknown."""
+    so_far_A = load_range_A(running.current_A[running.time_s > running.load_on_time_s])
+    if load is None:
+        return np.array(so_far_A)
+    if isinstance(load, Load) and load.unit == "current":
+        return np.array([*so_far_A, *load.value])
+    return np.array([*so_far_A, float(load) if isinstance(load, Real) else nan])
+
+
 def _usual_start(discharges: Sequence[Discharge], cut_off_V: float) -> DischargeStart | None:
     """Return the usual start of the discharges of a life, if they start and last alike; others may not start full."""
     loaded = []
@@ -296,9 +327,11 @@ def _row_of(discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: L
     record = discharge.loaded_part(cut_off_V)
     with_free_constants = free.estimate_of(fit)
     estimate = with_free_constants if fixed.prior.nuisance == free.prior.nuisance else fixed.estimate(record)
-    end_s = fixed.model.forecast(record, estimate, cut_off_V).eod_time_s
-    capacity_Ah = float(integrate_load(record.time_s, record.current_A, end_s)) / 3600.0
-    start_s, measured_s = record.time_s[0], discharge.eod_time_s(cut_off_V)
+    voltage = fixed.model.forecast(record, estimate, cut_off_V)
+    *drawn_C, capacity_C = integrate_load(record.time_s, record.current_A, [*record.time_s, voltage.eod_time_s])
+    start_s, end_s, measured_s = record.time_s[0], voltage.eod_time_s, discharge.eod_time_s(cut_off_V)
+    error_V, (least_A, most_A) = record.voltage_V - voltage.at_samples_V, load_range_A(record.current_A[1:])
+    is_simulated = np.isfinite(error_V)
     # a finding about the resistance is none about q_mobile
     of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]
     return {
@@ -312,14 +345,24 @@ def _row_of(discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: L
         "settled": estimate.settled,
         "findings": estimate.findings,
         "valid": estimate.settled_q_mobile or (not isnan(measured_s) and is_only_imprecise(of_charge)),
-        "capacity_Ah": capacity_Ah,
+        "capacity_Ah": capacity_C / 3600.0,
         "mean_current_A": mean_current_A(record),
+        "least_current_A": least_A,
+        "most_current_A": most_A,
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
+        "model_error": None
+        if isnan(measured_s)
+        else ModelError(np.array(drawn_C)[is_simulated] / estimate.q_mobile, error_V[is_simulated]),
     }
 
 
-def life_of(table: pd.DataFrame) -> Life:
-    """Follow ``q_mobile`` over the rows of a table, as :class:`Life` has it."""
+def life_of(table: pd.DataFrame, doubt_share: ArrayLike = 0.0) -> Life:
+    """
+    Follow ``q_mobile`` over the rows of a table, as :class:`Life` has it.
+
+    :param table: one row per discharge
+    :param doubt_share: further standard deviations of the estimates, as shares of ``q_mobile``, shape (discharges,)
+    """
     valid = table["valid"].to_numpy(dtype=np.bool_)
     if not valid.any():
         raise ValueError(f"no discharge determines q_mobile. {_most_common(table['findings'])}")
@@ -328,10 +371,13 @@ def life_of(table: pd.DataFrame) -> Life:
     centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
     expected = np.full((len(readings), 2), np.nan)
     state, covariance = np.zeros(2), np.zeros((2, 2))
+    doubts = np.broadcast_to(np.asarray(doubt_share, dtype=np.float64), len(readings)).copy()
 
     def surprise(logarithms: FloatArray) -> float:
         step, noise = np.exp(np.clip(logarithms, -15.0, 0.0))
-        out = _filtered(readings, steps, valid, first, step, noise, PRIOR_DRIFT_SD_SHARE, expected, state, covariance)
+        out = _filtered(
+            readings, steps, valid, first, step, np.hypot(noise, doubts), PRIOR_DRIFT_SD_SHARE, expected, state, covariance
+        )
         return float(out + 0.5 * ((logarithms - centre) ** 2).sum())
 
     best = minimize(surprise, centre, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4}).x
@@ -362,7 +408,7 @@ def _filtered(
     valid: BoolArray,
     first: int,
     step: float,
-    noise: float,
+    noise: FloatArray,
     drift_sd: float,
     expected: FloatArray,
     state: FloatArray,
@@ -371,7 +417,7 @@ def _filtered(
     # Kalman's recursions. Returns minus the log likelihood; fills the prediction of each reading (mean and variance of the
     # level) and the state after the last reading
     level, drift = readings[first], 0.0
-    p_level, p_both, p_drift = noise**2, 0.0, drift_sd**2
+    p_level, p_both, p_drift = noise[first] ** 2, 0.0, drift_sd**2
     surprise = 0.0
     for n in range(first + 1, len(readings)):
         level += steps[n] * drift
@@ -379,7 +425,7 @@ def _filtered(
         p_both += steps[n] * p_drift
         expected[n, 0], expected[n, 1] = level, p_level
         if valid[n]:
-            variance, innovation = p_level + noise**2, readings[n] - level
+            variance, innovation = p_level + noise[n] ** 2, readings[n] - level
             surprise += 0.5 * (np.log(variance) + innovation**2 / variance)
             gain_level, gain_drift = p_level / variance, p_both / variance
             level += gain_level * innovation

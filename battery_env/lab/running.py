@@ -148,14 +148,16 @@ def calibrate_running(
     discharge: Discharge, settings: Settings, load: LoadToCome | None = None, samples: int = 1000, life: Life | None = None
 ) -> Calibration:
     """Calibrate a discharge in progress, with the prior and the usual start of its earlier life, and forecast its end."""
+    model_error = None
     if life is not None:
+        model_error = life.model_error_for(discharge, load)
         start = life.usual_start or settings.usual_start
         settings = replace(settings, prior_q_mobile_C=life.prior_for(discharge, load), usual_start=start)
     # constants without a stated uncertainty carry over from a life, or to another load
     carries_over = settings.prior_q_mobile_C is not None and (life is not None or load is not None)
     loaded = cut(discharge, settings)
     fit = estimate(loaded, fixes_constants=carries_over and not settings.cell_rates_sd)
-    return calibration_of(loaded, fit, predict(loaded, fit, load, samples))
+    return calibration_of(loaded, fit, predict(loaded, fit, load, samples, model_error))
 
 
 def read_load(path: str | Path) -> Load:

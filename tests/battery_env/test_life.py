@@ -21,6 +21,9 @@ def followed(q_mobile_C, **columns):
         "cycle": np.arange(len(table)) + 1,
         "findings": [()] * len(table),
         "capacity_Ah": table["q_mobile_C"] / 3780.0,
+        "mean_current_A": 2.0,
+        "least_current_A": 2.0,
+        "most_current_A": 2.0,
         "lasted_share": 1.0,
     }
     return life_of(table.assign(**{**known, **columns}))
