@@ -71,6 +71,10 @@ class ErrorModel:
     dropouts_s: tuple[tuple[float, float], ...] = ()
     first_noise_V: float | None = None
 
+    def drift_after_V(self, charge_C: float) -> float:
+        """Standard deviation of the change of the drift over a charge, V."""
+        return self.drift_V * sqrt(2.0 * (1.0 - exp(-charge_C / self.memory_C)))
+
     def along(self, time_s: FloatArray, current_A: FloatArray) -> VoltageError:
         """
         The error at samples. At rest the drift goes on with time, as fast as under the mean load. A change of the load by its

@@ -390,8 +390,10 @@ class LeastSquares(Estimator):
             measured_ohm = step.fall_ohm(record, record.time_s, record.voltage_V, after_s)
             model_ohm = step.fall_ohm(record, record.time_s, model_V, after_s)
             of_model = ModelResistance.of(record, step, fitted.search, fitted.without_prior, after_s)
-            sd_ohm = sd_unit * of_model.sd_ohm
             noise_ohm = MOST_NOISE_SD * sd_unit * fitted.search.error.noise_V / step.size_A
+            # in the meantime the error of the model drifts
+            drift_ohm = sd_unit * fitted.search.error.drift_after_V(step.size_A * after_s) / step.size_A
+            sd_ohm = hypot(sd_unit * of_model.sd_ohm, drift_ohm)
             apart_ohm = abs(measured_ohm - model_ohm)
             # the measurement and the fit may have different moments of the switch
             if apart_ohm > 2.0 * of_model.moment_ohm + hypot(RESISTANCE_LIMIT_SD * sd_ohm, noise_ohm):
