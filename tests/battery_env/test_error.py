@@ -23,6 +23,15 @@ def test_whitened_errors_are_those_of_the_whole_covariance(load):
     np.testing.assert_array_equal(ErrorModel(noise_V=0.5).along(time_s, current_A).whitened(rows), rows / 0.5)
 
 
+def test_the_drift_over_a_charge_is_that_of_the_covariance():
+    model = ErrorModel(drift_V=0.05, noise_V=0.002, r_o=0.1, to=6.0, memory_C=900.0)
+    time_s = np.array([0.0, 60.0])
+    (length,) = model.along(time_s, np.array([2.0, 2.0])).correlation_lengths[1:]
+    variance_V2 = 2.0 * 0.05**2 * (1.0 - np.exp(-length))
+    assert model.drift_after_V(120.0) == pytest.approx(np.sqrt(variance_V2))
+    assert model.drift_after_V(0.0) == 0.0 and model.drift_after_V(1e6) == pytest.approx(0.05 * np.sqrt(2.0))
+
+
 @pytest.mark.parametrize("slower", sweep(3.0, 0.5, 2.0))
 @pytest.mark.parametrize("kinetics", sweep(0.3, 1.0))
 @pytest.mark.parametrize("prior_C", [None, (5500.0, 55.0)])

@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 
 from battery_env import Discharge, LeastSquares, Settings, calibrate, fit_cell, load_nasa_discharges, track_life
-from battery_env.electrochemistry import initial_state, simulate
+from battery_env.electrochemistry import NEW_CELL, initial_state, simulate
+from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.estimates import Finding
 from battery_env.lab.life import life_of
 from battery_env.lab.running import forecast_end
@@ -94,6 +95,15 @@ class TestSeries:
         assert early.prior_q_mobile_C == pytest.approx(1.02 * np.array(plain.prior_q_mobile_C))
         assert short.prior_q_mobile_C == plain.prior_q_mobile_C
 
+    def test_an_estimate_at_another_load_tells_less_of_this_one(self):
+        running = Discharge(np.arange(6) * 300.0, np.linspace(4.1, 3.6, 6), np.array([0.0] + [2.0] * 5))
+        q_C = 7000.0 * np.exp(-0.002 * np.arange(7))
+        off_C, other_A = q_C * np.where(np.arange(7) == 5, 1.03, 1.0), np.where(np.arange(7) == 5, 4.0, 2.0)
+        loads = {name: other_A for name in ("mean_current_A", "least_current_A", "most_current_A")}
+        lives = [followed(q_C), followed(off_C, **loads), followed(off_C)]
+        right, told, not_told = (replace(life, sd_share=0.02).prior_for(running)[0] for life in lives)
+        assert told == pytest.approx(right, rel=2e-3) and not_told > 1.005 * right
+
     def test_a_lower_threshold_is_reached_later(self):
         life = followed(walk(1, 60))
         now_Ah = float(life.table["capacity_Ah"].iloc[-1])
@@ -150,6 +160,20 @@ class TestRealCell:
         # free constants explain a part of the error, and which they are is one more doubt
         np.testing.assert_allclose(unsure.table["q_mobile_C"], held.table["q_mobile_C"], rtol=0.002)
         assert by_default.sd_share == unsure.sd_share == by_default.after(2).sd_share > 1.2 * held.sd_share
+
+    @pytest.mark.parametrize("share", sweep(0.5, 0.25, 0.75))
+    def test_what_the_model_missed_before_it_misses_again(self, share):
+        kind = with_equilibrium(NEW_CELL.replace(kn=1500.0, tDiffusion=5e6), [-0.1, 0.0, 0.0, 0.0, 0.05, 0.0, 0.05])
+        lived = [
+            simulate(2.0, q_C, 0.12, load_unit="current", cell=kind, thermal=True, cut_off_V=2.5) for q_C in (7100.0, 7000.0)
+        ]
+        before, running = (Discharge(each.time_s[::10], each.voltage_V[::10], each.current_A[::10]) for each in lived)
+        life, end_s = track_life([before], 2.7), running.eod_time_s(2.7)
+        life = replace(life, state=np.log(7000.0 / 7100.0) * np.array([1.0, 0.0]) + life.state)
+        forgetful = replace(life, table=life.table.assign(model_error=None))
+        seen = running.until(share * end_s)
+        errors = [abs(forecast_end(seen, life=each).eod_quantile_s(0.5) / end_s - 1.0) for each in (life, forgetful)]
+        assert errors[0] < 0.001 < errors[1]
 
     def test_what_contradicts_is_left_out_and_the_others_count(self):
         first, second, third, fourth = self.discharges
