@@ -26,7 +26,7 @@ from battery_env.estimates.findings import Doubt, Reason
 from battery_env.estimators.diagnosis.evidence import Evidence, evidence_of
 from battery_env.estimators.diagnosis.rest import Start, check_initial_soc, soc_from_rest
 from battery_env.estimators.resistance import measured_resistance_ohm
-from battery_env.lab.forecast import Forecast, ModelError, forecast
+from battery_env.lab.forecast import Forecast, forecast
 from battery_env.lab.readers.columns import FileFormat
 from battery_env.lab.readers.discharges import map_usable, read_recordings
 from battery_env.lab.readers.testers import Tester, find_tester
@@ -46,7 +46,7 @@ from battery_env.records import (
     mean_current_A,
 )
 from battery_env.records.discharge import Discharge
-from battery_env.records.model import RecordModel, VoltageForecast
+from battery_env.records.model import ModelError, RecordModel, VoltageForecast
 
 # A record of more samples than this is averaged over the time step of the model, or over longer steps if the record has more
 # than this many of them: the model has no use for samples in between.
@@ -275,8 +275,9 @@ def predict(
     settings, cut_off_V, result = loaded.settings, loaded.settings.resolved.cut_off_V, fit.estimate
     if settings.prior_q_mobile_C is None and settings.fit is not None:
         result = result.within(*settings.fit.life_q_mobile_C)
+    record = Samples.of(loaded.record)
     end = forecast(
-        loaded.record,
+        record if model_error is None else model_error.removed_from(record, result.q_mobile),
         _in_units_of_the_sensor(result, settings.current_gain_sd),
         load,
         cut_off_V,
@@ -284,7 +285,6 @@ def predict(
         mismatch_V=settings.resolved.mismatch_V,
         nominal_Ah=settings.nominal_Ah,
         samples=samples,
-        model_error=model_error,
     )
     # independent of the draws of the forecast, whose seed is 0
     gains = 1.0 + settings.current_gain_sd * np.random.default_rng([0, 1]).standard_normal(samples)
@@ -293,6 +293,7 @@ def predict(
     has_health = settings.nominal_Ah is not None or settings.tells_new_capacity(load_A)
     return replace(
         end,
+        record=record,
         q_mobile=gains * end.q_mobile,
         capacity_Ah=gains * end.capacity_Ah,
         r_o=end.r_o / gains,

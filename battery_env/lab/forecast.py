@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import floor, inf, log10
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,18 +34,6 @@ _NOMINAL_DRAWS = 100
 _CONTRADICTION_SD = 5.0
 # A figure ends at most at this multiple of the record, or of its median end.
 _LONGEST_PLOTTED = 1.5
-
-
-class ModelError(NamedTuple):
-    """
-    What the model misses over a discharge, to its cut-off.
-
-    :param drawn_share: charge drawn, as a share of ``q_mobile``, shape (T,)
-    :param error_V: the measured voltage less that of the model, V, shape (T,)
-    """
-
-    drawn_share: FloatArray
-    error_V: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +163,6 @@ def forecast(
     nominal_Ah: float | None = None,
     samples: int = 1000,
     seed: int = 0,
-    model_error: ModelError | None = None,
 ) -> Forecast:
     """
     Forecast the end of a discharge in progress, under a load to come, with its uncertainty.
@@ -188,9 +175,8 @@ def forecast(
     of this record implies. Standard deviations of NaN count as zero, and ``notes`` say so.
 
     *The error of the model* has the standard deviation ``mismatch_V``. Shortly before the end of the record the error is the
-    mean difference between measured and modelled voltage, so that samples of any resistance agree with the measurement. A
-    known ``model_error`` is no part of that difference, as the estimate allows for it. Then the error drifts with the charge
-    drawn. Samples that would have reached the cut-off within the record are replaced.
+    mean difference between measured and modelled voltage, so that samples of any resistance agree with the measurement.
+    Then the error drifts with the charge drawn. Samples that would have reached the cut-off within the record are replaced.
 
     *The load.* Without ``load`` the discharge continues: at its last current if the current was constant (at rest if the load
     was switched off), and otherwise in blocks of the record (:class:`battery_env.loads.BlockBootstrap`), of current or of
@@ -210,8 +196,6 @@ def forecast(
         ``q_mobile`` and ``r_o``, gives from full under the load to come, on average if the load is random
     :param samples: number of samples
     :param seed: seed of all random draws
-    :param model_error: what the model missed over an earlier discharge at this load, if the estimate allows for that, as with
-        the prior of a life (:meth:`battery_env.lab.life.Life.model_error_for`); ``None``: unknown
     :return: the samples, with quantiles, a summary and a plot
     :raises TypeError: for a load of another type
     :raises ValueError: for an argument out of range, an estimate that the record contradicts, or a load that charges the cell
@@ -228,7 +212,7 @@ def forecast(
     model = model.at(estimate)
     _, current_A = model.grid(measured)
     q_C, r_ohm, acting_ohm = _draw_parameters(model, current_A[:-1], estimate, mismatch_V, samples, rng)
-    cells, voltage_V = _cells_at_the_end(measured, model, current_A, (q_C, acting_ohm), mismatch_V, model_error, rng)
+    cells, voltage_V = _cells_at_the_end(measured, model, current_A, (q_C, acting_ohm), mismatch_V, rng)
     reached_V = cut_off + _ROUNDING_V
     has_ended = measured.voltage_V[-1] <= reached_V and measured.current_A[-1] > 0.0
     if not has_ended:
@@ -393,7 +377,6 @@ def _cells_at_the_end(
     current_A: FloatArray,
     parameters: tuple[FloatArray, FloatArray],
     mismatch_V: float,
-    model_error: ModelError | None,
     rng: np.random.Generator,
 ) -> tuple[Cells, FloatArray]:
     """
@@ -402,9 +385,6 @@ def _cells_at_the_end(
     """
     steps, count = len(current_A) - 1, len(parameters[0])
     measured_V = np.interp(record.time_s[0] + model.dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)
-    if model_error is not None:
-        drawn_share = model.dt_s * np.append(0.0, np.cumsum(current_A[:-1])) / np.median(parameters[0])
-        measured_V -= np.interp(drawn_share, *model_error)
     last = slice(min(int((1.0 - RECENT_SHARE) * steps), steps - 1) + 1, None)
     at_first = Cells(*parameters, model.start(parameters[0]), np.zeros(count), np.zeros(count))
     cells, run_V = simulate_current(at_first, model, current_A[:-1], steps - last.start)

@@ -25,11 +25,11 @@ from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, r
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import Alternative, LeastSquares, RecordFit
 from battery_env.estimators.resistance import measured_resistance_ohm
-from battery_env.lab.forecast import ModelError
 from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.records import VARIED_SHARE, DischargeStart, drawn_charge_C, integrate_load, load_range_A, mean_current_A
 from battery_env.records.discharge import Discharge
+from battery_env.records.model import ModelError
 
 #: Priors of a life, as shares of q_mobile: the step from one discharge to the next and the independent error of an estimate
 #: (both to a factor of e, one standard deviation), and the standard deviation of the drift.
@@ -55,7 +55,7 @@ class Life:
         ``settled_resistance_10s``, ``measured_resistance_10s_ohm``, ``r_o_ohm``, ``settled``, ``findings``, ``reason``,
         ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off), ``mean_current_A``, ``least_current_A`` and
         ``most_current_A`` (without a few extremes), ``lasted_share`` (its duration, as a share of the model's at this
-        ``q_mobile``; NaN if it was cut short), ``model_error`` (a :class:`~battery_env.lab.forecast.ModelError`; ``None`` if
+        ``q_mobile``; NaN if it was cut short), ``model_error`` (a :class:`~battery_env.records.model.ModelError`; ``None`` if
         it was cut short), and the prediction from the earlier discharges, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN
         for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``

@@ -30,8 +30,8 @@ from battery_env.electrochemistry.ends import LONGEST_S, Cells, FutureLoad, simu
 from battery_env.electrochemistry.tangents import TANGENT_NAMES, PolynomialDerivatives, least_q_mobile, roll_out_with_tangents
 from battery_env.estimates import Estimate
 from battery_env.parameters import Q_MOBILE, R_O
-from battery_env.records.load import expected_current, resample_current
-from battery_env.records.samples import Record, check_record
+from battery_env.records.load import expected_current, integrate_load, resample_current
+from battery_env.records.samples import Record, Samples, check_record
 
 # The total of the four charges is q_mobile / 0.6 at all times.
 _Q_PER_CHARGE = 1.0 / float(FULL_CHARGE_SHARES.sum())
@@ -85,6 +85,24 @@ class VoltageForecast:
             return time_s, voltage_V
         is_above = time_s < end_s
         return np.append(time_s[is_above], end_s), np.append(voltage_V[is_above], self.cut_off_V)
+
+
+class ModelError(NamedTuple):
+    """
+    What the model misses over a discharge, to its cut-off.
+
+    :param drawn_share: charge drawn, as a share of ``q_mobile``, shape (T,)
+    :param error_V: the measured voltage less that of the model, V, shape (T,)
+    """
+
+    drawn_share: FloatArray
+    error_V: FloatArray
+
+    def removed_from(self, record: Record, q_mobile: float) -> Record:
+        """Return a record of a discharge alike without this error."""
+        samples = Samples.of(record)
+        drawn_share = integrate_load(samples.time_s, samples.current_A, samples.time_s) / q_mobile
+        return samples._replace(voltage_V=samples.voltage_V - np.interp(drawn_share, *self))
 
 
 class Tangents(NamedTuple):
