@@ -36,13 +36,7 @@ def check_integer(**values: float) -> None:
 
 
 def stated_parameters(problem: type["CostEnv"], options: dict[str, Any]) -> dict[str, float]:
-    """
-    Take the physical parameters out of the options of a problem, whose class states each of them once, with its default.
-
-    :param problem: The class, whose annotated attributes they are
-    :param options: Arguments by name; those that are parameters leave it
-    :return: All parameters by name
-    """
+    """Take the parameters out of the options of a problem, whose class states each as an attribute with its default."""
     return {name: options.pop(name, getattr(problem, name)) for name in inspect.get_annotations(problem)}
 
 

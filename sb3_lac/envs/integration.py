@@ -4,10 +4,7 @@ from collections.abc import Callable, Sequence
 def runge_kutta_step(
     derivative: Callable[[Sequence[float]], Sequence[float]], state: Sequence[float], dt_s: float
 ) -> list[float]:
-    """
-    One step of the classical Runge-Kutta method of fourth order. For a handful of variables, plain numbers are faster than
-    arrays.
-    """
+    """Make a step of the classical Runge-Kutta method, with plain numbers: for a few variables they are faster than arrays."""
     half = 0.5 * dt_s
     k1 = derivative(state)
     k2 = derivative([x + half * k for x, k in zip(state, k1, strict=True)])

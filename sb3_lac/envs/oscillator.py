@@ -94,10 +94,7 @@ class OscillatorEnv(CostEnv):
         super().__init__(parameters, np.zeros(6), np.full(6, self.STATE_MAX), observation_space, n_actions=3, **options)
 
     def reference(self, step: int) -> float:
-        """
-        :param step: Steps since the start
-        :return: What the first protein should be
-        """
+        """Return what the first protein should be so many steps after the start."""
         return 8.0 + 7.0 * float(np.sin(2.0 * np.pi * step / self.PERIOD_STEPS))
 
     def _initial_state(self) -> np.ndarray:

@@ -146,10 +146,7 @@ class VehicleCostEnv(CostEnv):
                 raise ValueError(f"{name}={parameters[name]} must be at most {largest:.4g}.")
 
     def curvature(self, distance_m: float) -> float:
-        """
-        :param distance_m: Distance s along the path
-        :return: Curvature of the path in 1/m
-        """
+        """Return the curvature of the path in 1/m, at a distance along it in m."""
         return self.PATH_CURVATURE_1_m * math.sin(math.tau * distance_m / self.PATH_PERIOD_M)
 
     def _initial_state(self) -> np.ndarray:

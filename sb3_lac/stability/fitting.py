@@ -36,11 +36,7 @@ WINDOWS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
 class SumOfSquares(nn.Module):
-    """
-    A network that is never negative: the sum of the squares of its last layer.
-
-    :param n_inputs: Number of inputs
-    """
+    """A network that is never negative: the sum of the squares of its last layer."""
 
     def __init__(self, n_inputs: int):
         super().__init__()
@@ -58,16 +54,10 @@ class SumOfSquares(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class InputRange:
-    """
-    The numbers that observations were made of on the roll-outs of a fit, each of shape (n_inputs,).
-
-    :param mean: Mean
-    :param scale: Standard deviation, infinite for a number that never changed, which nothing is known of
-    :param low: Least value
-    :param high: Largest value
-    """
+    """The numbers that observations were made of on the roll-outs of a fit, each of shape (n_inputs,)."""
 
     mean: np.ndarray
+    #: Standard deviation, infinite for a number that never changed, which nothing is known of
     scale: np.ndarray
     low: np.ndarray
     high: np.ndarray
