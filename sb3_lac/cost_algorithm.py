@@ -148,7 +148,7 @@ class CostAlgorithm(SAC):
         """Return ``L`` of a cost of 1 at each step, infinite without a discount."""
         return 1 / (1 - self.gamma) if self.gamma < 1 else math.inf
 
-    def bound_in(self, vec_normalize: VecNormalize | None) -> RewardBound:
+    def bound_in(self, vec_normalize: VecNormalize | None = None) -> RewardBound:
         """The bound, in the units that the agent sees through a normalization."""
         return RewardBound(self.policy, self.reward_bound or 0.0, self.n_costs, vec_normalize)
 
@@ -156,10 +156,6 @@ class CostAlgorithm(SAC):
     def largest_reward(self) -> th.Tensor:
         """The largest reward stated or seen, before any normalization, shape (1,). It is part of the policy, as ``L`` is."""
         return self.policy.reward_bound
-
-    def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
-        """The reward that costs nothing, in the units of the rewards that the agent sees, shape (1,)."""
-        return self.bound_in(vec_normalize).value
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         self._adopt_replay_buffer()

@@ -90,6 +90,8 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
     error_tolerance: float
     impulse: float
     action_delay: int
+    #: None until the first episode starts
+    state: np.ndarray
 
     def __init__(
         self,
@@ -136,7 +138,7 @@ class CostEnv(gym.Env[np.ndarray, np.ndarray]):
         for values in (self._randomisation.smallest, self._randomisation.largest, {**fixed, **changed}):
             self._disturb(values)
         self.render_mode = render_mode
-        self.state: np.ndarray | None = None
+        self.state = None  # type: ignore[assignment]
         self.n_steps = 0
 
     def _disturb(self, values: Mapping[str, Any]) -> None:

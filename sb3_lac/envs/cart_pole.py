@@ -117,7 +117,6 @@ class CartPoleCostEnv(CostEnv):
         return float(cost), False
 
     def _error(self) -> float:
-        assert self.state is not None
         x, _, theta, _ = self.state.tolist()
         length = 2 * self.pole_half_length_m
         return math.hypot(x + length * math.sin(theta), length * (1.0 - math.cos(theta)))

@@ -104,7 +104,6 @@ class LinearCostEnv(CostEnv):
         return float(state @ self.Q @ state + control @ self.R @ control), False
 
     def _error(self) -> float:
-        assert self.state is not None
         return math.hypot(*self.state)
 
     def _draw(self, axes: "Axes", states: np.ndarray) -> None:

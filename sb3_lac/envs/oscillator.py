@@ -101,7 +101,6 @@ class OscillatorEnv(CostEnv):
         return self.np_random.uniform(0.0, 5.0, 6)
 
     def _observation(self) -> np.ndarray:
-        assert self.state is not None
         return np.array([*self.state, self.reference(self.n_steps), self.reference(self.n_steps + 1)], dtype=np.float32)
 
     def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
@@ -116,7 +115,6 @@ class OscillatorEnv(CostEnv):
         return float((next_state[3] - self.reference(self.n_steps + 1)) ** 2), False
 
     def _error(self) -> float:
-        assert self.state is not None
         return abs(float(self.state[3]) - self.reference(self.n_steps))
 
     def _draw(self, axes: "Axes", states: np.ndarray) -> None:

@@ -105,7 +105,6 @@ class PendulumCostEnv(CostEnv):
         return self.np_random.uniform(-1.0, 1.0, 2) * (math.pi, 1.0)
 
     def _observation(self) -> np.ndarray:
-        assert self.state is not None
         theta, speed = self.state.tolist()
         return np.array([math.cos(theta), math.sin(theta), speed], dtype=np.float32)
 
@@ -131,7 +130,6 @@ class PendulumCostEnv(CostEnv):
         return theta**2 + 0.1 * speed**2 + 0.01 * torque**2, False
 
     def _error(self) -> float:
-        assert self.state is not None
         return abs(float(self.state[0]))
 
     def _draw(self, axes: "Axes", states: np.ndarray) -> None:

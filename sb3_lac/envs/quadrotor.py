@@ -131,7 +131,6 @@ class QuadrotorCostEnv(CostEnv):
         return position * (x**2 + z**2) + pitch * phi**2 + effort * (left**2 + right**2), False
 
     def _error(self) -> float:
-        assert self.state is not None
         return math.hypot(self.state[0], self.state[1])
 
     def _draw(self, axes: "Axes", states: np.ndarray) -> None:

@@ -155,7 +155,6 @@ class VehicleCostEnv(CostEnv):
         return start
 
     def _observation(self) -> np.ndarray:
-        assert self.state is not None
         *moving, distance = self.state.tolist()
         curvature, ahead = self.curvature(distance), self.curvature(distance + self.PREVIEW_M)
         return np.array([*moving, self.speed_m_s * curvature, self.speed_m_s * ahead], dtype=np.float32)
@@ -202,7 +201,6 @@ class VehicleCostEnv(CostEnv):
         return offset_weight * offset**2 + course_weight * course**2 + turn_weight * turn**2, False
 
     def _error(self) -> float:
-        assert self.state is not None
         return abs(float(self.state[0]))
 
     def _draw(self, axes: "Axes", states: np.ndarray) -> None:

@@ -13,6 +13,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
+from tqdm import tqdm
 
 from sb3_lac.stability.functions import LyapunovFunction, Observations
 from sb3_lac.stability.loop import by_keyword, closed_loop
@@ -243,8 +244,6 @@ class _Data:
 
 def _learn(network: SumOfSquares, data: _Data, reward_bound: float, seed: int, progress_bar: bool) -> float:
     """Fit a network to the returns, and return the average cost."""
-    from tqdm import tqdm  # only a fit needs it
-
     costs, n = data.costs, len(data.costs)
     rng = np.random.default_rng(seed)
     optimizer = th.optim.Adam(network.parameters(), lr=LEARNING_RATE)
