@@ -1,12 +1,9 @@
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, stated_parameters
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from sb3_lac.envs.base import Axes, CostEnv, stated_parameters
 
 
 class OscillatorEnv(CostEnv):
@@ -117,7 +114,7 @@ class OscillatorEnv(CostEnv):
     def _error(self) -> float:
         return abs(float(self.state[3]) - self.reference(self.n_steps))
 
-    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+    def _draw(self, axes: Axes, states: np.ndarray) -> None:
         axes.set(xlim=(-1.0, 15.5), ylim=(-4.5, 17.5), aspect="auto")
         # The ring of proteins, each of which represses the next; their areas are the concentrations
         places, present = [(3.9, 13.0), (6.6, 1.5), (1.2, 1.5)], self.n_steps

@@ -1,15 +1,11 @@
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative, stated_parameters
-from sb3_lac.envs.integration import runge_kutta_step
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from sb3_lac.envs.base import Axes, CostEnv, check_not_negative, runge_kutta_step, stated_parameters
 
 
 class PendulumCostEnv(CostEnv):
@@ -132,7 +128,7 @@ class PendulumCostEnv(CostEnv):
     def _error(self) -> float:
         return abs(float(self.state[0]))
 
-    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+    def _draw(self, axes: Axes, states: np.ndarray) -> None:
         reach = 1.25 * self.length_m
         axes.set(xlim=(-1.33 * reach, 1.33 * reach), ylim=(-reach, reach))
         x, z = self.length_m * np.sin(states[:, 0]), self.length_m * np.cos(states[:, 0])

@@ -1,15 +1,11 @@
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, stated_parameters
-from sb3_lac.envs.integration import runge_kutta_step
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from sb3_lac.envs.base import Axes, CostEnv, runge_kutta_step, stated_parameters
 
 
 class VehicleCostEnv(CostEnv):
@@ -203,7 +199,7 @@ class VehicleCostEnv(CostEnv):
     def _error(self) -> float:
         return abs(float(self.state[0]))
 
-    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+    def _draw(self, axes: Axes, states: np.ndarray) -> None:
         # The car from above, on a piece of the path around it; points of the plane are complex numbers
         offset, heading, _, _, steering, distance_m = states[-1]
         distances = math.floor(distance_m) + np.arange(-20.0, 45.0, 0.25)
