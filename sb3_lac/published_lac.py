@@ -43,14 +43,10 @@ class SumOfSquaresCritic(LyapunovCritic):
 class PublishedPolicy(LyapunovPolicy):
     """
     Policy class (with both actor and critic) for ``PublishedLAC``: the policy of LAC with a ``SumOfSquaresCritic``, a target
-    actor, and the networks of Han et al. (2020).
+    actor, and the networks of Han et al. (2020). ``LyapunovPolicy`` describes the arguments that are not listed here.
 
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param lr_schedule: Learning rate schedule (could be constant)
     :param net_arch: Hidden layers of the actor (``pi``) and of the critic (``qf``); the critic squares its last layer
     :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
-    :param kwargs: The other arguments of ``LyapunovPolicy``
     """
 
     critic_class = SumOfSquaresCritic
