@@ -182,7 +182,7 @@ class RootCritic(LyapunovCritic):
         return signed_power(self.distance(roots), 2) + self.floor
 
     def distance(self, roots: th.Tensor) -> th.Tensor:
-        """Get signed square roots of what values are above the floor, which are like a norm where values are like its square."""
+        """Get signed square roots of what values are above the floor: like a norm, where values are like its square."""
         if self.degree is not None:
             return signed_power(roots, self.degree // 2)
         return signed_power(roots, 2) / (self.scale + roots.abs()).clamp(min=th.finfo(roots.dtype).tiny)
