@@ -152,14 +152,13 @@ class CertificateCallback(LyapunovCallback):
     same initial states, and no function is judged on its own fit. Without any cost all values are NaN. TensorBoard also gets
     two figures, ``certificate/drift`` and ``certificate/statements``.
 
-    :param eval_env: The environment used for evaluation, as for ``LyapunovCallback``
+    ``LyapunovCallback`` describes the arguments that are not listed here.
+
     :param callback_after_eval: Callback to trigger after every evaluation, which finds the reports in
         ``self.parent.last_report`` and ``self.parent.last_certification``
     :param n_episodes: Number of episodes for each of the three
-    :param eval_freq: Evaluate the agent every ``eval_freq`` call of the callback.
     :param ultimate_bound: The cost to stay within, the largest late cost of the roll-outs of the fit by default
     :param seed: Seed of each evaluation, far from those of the training; if None, each evaluation draws a seed
-    :param verbose: Verbosity level: 0 for no output, 1 for the summary of each evaluation
     """
 
     FOLDER = "certificate"

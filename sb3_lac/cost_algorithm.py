@@ -10,14 +10,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
 from stable_baselines3.common.vec_env import VecNormalize
-from stable_baselines3.sac.policies import Actor
+from stable_baselines3.sac.sac import SAC
 
 from sb3_lac.buffers import Samples, batches_at_once, split
 from sb3_lac.checks import (
@@ -38,28 +36,22 @@ from sb3_lac.updates import Metrics, backward, same_distributions
 SelfCostAlgorithm = TypeVar("SelfCostAlgorithm", bound="CostAlgorithm")
 
 
-class CostAlgorithm(OffPolicyAlgorithm):
+class CostAlgorithm(SAC):
     """
-    Soft actor-critic for the cost ``bound - reward >= 0``, where ``bound`` is the largest reward stated or seen, at least 0.
-    After a termination nothing is paid, so that each step costs ``bound``: ``L`` is ``bound / (1 - gamma)`` there. Multipliers
-    hold the entropy of the policy and a decrease of ``L``. Subclasses say what an update is, in ``_update()``. The arguments
-    are described there.
+    SAC for the cost ``bound - reward >= 0``, where ``bound`` is the largest reward stated or seen, at least 0. After a
+    termination nothing is paid, so that each step costs ``bound``: ``L`` is ``bound / (1 - gamma)`` there. Multipliers hold
+    the entropy of the policy and a decrease of ``L``. Subclasses say what an update is, in ``_update()``.
     """
 
     policy: LyapunovPolicy
-    actor: Actor
-    critic: LyapunovCritic
-    critic_target: LyapunovCritic
+    critic: LyapunovCritic  # type: ignore[assignment]
+    critic_target: LyapunovCritic  # type: ignore[assignment]
 
     def __init__(
         self,
         policy: str | type[LyapunovPolicy],
         env: GymEnv | str,
         *,
-        gamma: float | str,
-        ent_coef: str | float,
-        target_update_interval: int,
-        target_entropy: str | float,
         alpha3: float,
         lambda_init: float,
         lambda_min: float,
@@ -70,20 +62,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         check_observations: bool = True,
         **kwargs: Any,
     ):
-        super().__init__(
-            policy,
-            env,
-            gamma=gamma,  # type: ignore[arg-type]  # a number from _setup_model() on
-            supported_action_spaces=(spaces.Box,),
-            support_multi_env=True,
-            **kwargs,
-        )
-        self.target_entropy = target_entropy
-        self.log_ent_coef = None  # type: th.Tensor | None
-        # Entropy coefficient / Entropy temperature
-        self.ent_coef = ent_coef
-        self.target_update_interval = target_update_interval
-        self.ent_coef_optimizer: th.optim.Adam | None = None
+        super().__init__(policy, env, _init_setup_model=False, **kwargs)
         self.alpha3 = alpha3
         self.lambda_init = lambda_init
         self.lambda_min = lambda_min
@@ -107,38 +86,19 @@ class CostAlgorithm(OffPolicyAlgorithm):
                     raise ValueError(f"{name}={value!r} must be a number.") from None
         self._check_arguments()
 
+        # SAC asks the environment, which a model that is loaded may do without
+        if self.target_entropy == "auto":
+            self.target_entropy = float(-np.prod(self.action_space.shape))  # type: ignore[arg-type]
         super()._setup_model()
+        # SAC has the statistics of the critics alone
+        self._create_aliases()
         # A class of somebody else may store something else than the model observes
         self._stored_spaces = spaces_of(self.replay_buffer)
         self._adopt_replay_buffer()
-        self._create_aliases()
-        # Target entropy is used when learning the entropy coefficient
-        if self.target_entropy == "auto":
-            # automatically set target entropy if needed
-            self.target_entropy = float(-np.prod(self.action_space.shape))  # type: ignore[arg-type]
-        else:
-            # Force conversion
-            # this will also throw an error for unexpected string
-            self.target_entropy = float(self.target_entropy)
-
-        # The entropy coefficient or entropy can be learned automatically
-        # see Automating Entropy Adjustment for Maximum Entropy RL section
-        # of https://arxiv.org/abs/1812.05905
-        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
-            # Default initial value of ent_coef when learned
-            init_value = 1.0
-            if "_" in self.ent_coef:
-                init_value = float(self.ent_coef.split("_")[1])
-                assert init_value > 0.0, "The initial value of ent_coef must be greater than 0"
-            self.log_ent_coef, self.ent_coef_optimizer = self._make_multiplier(init_value)
-        else:
-            # Force conversion to float
-            # this will throw an error if a malformed string (different from 'auto')
-            # is passed
-            self.ent_coef_tensor = th.tensor(float(self.ent_coef), device=self.device)
 
         # The multiplier of the decrease condition is learned like that of the entropy
-        self.log_lambda, self.lambda_optimizer = self._make_multiplier(self.lambda_init)
+        self.log_lambda = th.log(th.ones(1, device=self.device) * self.lambda_init).requires_grad_(True)
+        self.lambda_optimizer = th.optim.Adam([self.log_lambda], lr=self.lr_schedule(1))
         self._project_lambda()
 
         if self.compile_update:
@@ -147,7 +107,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         self.bound_in(self._vec_normalize_env).raise_to(0.0)
 
     def _create_aliases(self) -> None:
-        self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
+        super()._create_aliases()
         # Running mean and running var
         self.batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
         self.batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
@@ -175,11 +135,6 @@ class CostAlgorithm(OffPolicyAlgorithm):
             # One discount for returns and values
             self.replay_buffer.gamma = self.gamma
 
-    def _make_multiplier(self, initial: float) -> tuple[th.Tensor, th.optim.Adam]:
-        """The logarithm of a Lagrange multiplier, and its optimizer."""
-        log_multiplier = th.log(th.ones(1, device=self.device) * initial).requires_grad_(True)
-        return log_multiplier, th.optim.Adam([log_multiplier], lr=self.lr_schedule(1))
-
     def _project_lambda(self) -> th.Tensor:
         """Keep ``lambda`` within its limits, and tell whether it is at the upper one."""
         upper = math.log(max(self.lambda_init, 1.0) if self.lambda_max is None else self.lambda_max)
@@ -193,7 +148,7 @@ class CostAlgorithm(OffPolicyAlgorithm):
         """Return ``L`` of a cost of 1 at each step, infinite without a discount."""
         return 1 / (1 - self.gamma) if self.gamma < 1 else math.inf
 
-    def bound_in(self, vec_normalize: VecNormalize | None) -> RewardBound:
+    def bound_in(self, vec_normalize: VecNormalize | None = None) -> RewardBound:
         """The bound, in the units that the agent sees through a normalization."""
         return RewardBound(self.policy, self.reward_bound or 0.0, self.n_costs, vec_normalize)
 
@@ -201,14 +156,6 @@ class CostAlgorithm(OffPolicyAlgorithm):
     def largest_reward(self) -> th.Tensor:
         """The largest reward stated or seen, before any normalization, shape (1,). It is part of the policy, as ``L`` is."""
         return self.policy.reward_bound
-
-    def cost_bound(self, vec_normalize: VecNormalize | None = None) -> th.Tensor:
-        """The reward that costs nothing, in the units of the rewards that the agent sees, shape (1,)."""
-        return self.bound_in(vec_normalize).value
-
-    def update_offset(self, vec_normalize: VecNormalize | None) -> None:
-        """Give the critics the value of ``L`` where nothing is ever paid."""
-        self.bound_in(vec_normalize).update_offset()
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         self._adopt_replay_buffer()
@@ -412,14 +359,11 @@ class CostAlgorithm(OffPolicyAlgorithm):
         return model
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["actor", "critic", "critic_target", "batch_norm_stats", "batch_norm_stats_target", "_compiled"]
-        return super()._excluded_save_params() + own
+        return [*super()._excluded_save_params(), "batch_norm_stats", "batch_norm_stats_target", "_compiled"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts = ["policy", "actor.optimizer", "critic.optimizer", "lambda_optimizer"]
-        if self.ent_coef_optimizer is None:
-            return state_dicts, ["log_lambda", "ent_coef_tensor"]
-        return [*state_dicts, "ent_coef_optimizer"], ["log_lambda", "log_ent_coef"]
+        state_dicts, tensors = super()._get_torch_save_params()
+        return [*state_dicts, "lambda_optimizer"], ["log_lambda", *tensors]
 
 
 def update_multiplier(log_multiplier: th.Tensor, optimizer: th.optim.Optimizer, violation: th.Tensor) -> th.Tensor:

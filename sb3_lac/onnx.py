@@ -52,11 +52,8 @@ _FAR = 1e6
 
 class DeterministicPolicy(th.nn.Module):
     """
-    ``predict(observation, deterministic=True)`` as one graph of tensors, from the environment's observations to its actions.
-    Of several policies it has the mean.
-
-    :param policies: Policies of the same ``Box`` observations and actions
-    :param vec_normalize: What normalizes their observations, if anything does
+    ``predict(observation, deterministic=True)`` as one graph of tensors, from observations of the environment to its actions;
+    of several policies it has the mean.
     """
 
     policies: Sequence[BasePolicy]

@@ -34,20 +34,7 @@ def signed_power(values: th.Tensor, exponent: int) -> th.Tensor:
 class LyapunovCritic(BaseModel):
     """
     Lyapunov critic network(s): each maps state and action to a value ``L(s, a) >= 0``, the discounted cost. Subclasses define
-    the output of a network, for example a root of ``L``.
-
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param net_arch: Sizes of the hidden layers
-    :param features_extractor: Network to extract features
-        (a CNN when using images, a nn.Flatten() layer otherwise)
-    :param features_dim: Number of features
-    :param activation_fn: Activation function of the hidden layers
-    :param normalize_images: Whether to normalize images or not,
-         dividing by 255.0 (True by default)
-    :param n_critics: Number of critic networks to create
-    :param share_features_extractor: Whether the features extractor is shared with the actor
-        (it is then trained by the loss of the actor only)
+    the output of a network, for example a root of ``L``. The arguments are those of ``ContinuousCritic`` of Stable-Baselines3.
     """
 
     action_space: spaces.Box
@@ -120,22 +107,11 @@ class LyapunovCritic(BaseModel):
         return self(obs, actions, as_values=False)
 
     def lyapunov_of(self, output: th.Tensor) -> th.Tensor:
-        """
-        Get the values of ``L`` that outputs of a network belong to.
-
-        :param output: What a network gives
-        :return: As many values of shape (n, 1), offset included, and none negative
-        """
+        """Get the values of ``L`` that outputs of a network belong to, shape (n, 1): offset included, and none negative."""
         raise NotImplementedError
 
     def lyapunov(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-        """
-        Get the conservative values ``L(s, a)``, the largest of the critics'.
-
-        :param obs: Observations, preprocessed by ``extract_features()``
-        :param actions: As many flat actions in [-1, 1]
-        :return: Values of shape (n, 1)
-        """
+        """Get the conservative values ``L(s, a)``, the largest of the critics', shape (n, 1); see ``forward()``."""
         return largest_value(self(obs, actions))
 
 
@@ -186,24 +162,15 @@ class RootCritic(LyapunovCritic):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def follow(self, values: th.Tensor, rate: float) -> None:
-        """
-        Let the floor follow the lowest value, and the scale a tenth of the mean distance from the floor.
-
-        :param values: Values relative to the offset, of a batch
-        :param rate: Share of the way in one update; the first scale is taken as it is
-        """
+        """Move the floor to the lowest value, and the scale to a tenth of the mean distance, by a share of the way."""
         self.floor.lerp_(values.min(), rate)
         if self.degree is None:
             scale = _SCALE * (values - self.floor).abs().sqrt().mean()
+            # The first one is taken as it is
             self.scale.copy_(th.where(self.scale == 0, scale, self.scale.lerp(scale, rate)))
 
     def root(self, values: th.Tensor) -> th.Tensor:
-        """
-        Get what the networks learn of values.
-
-        :param values: Values relative to the offset
-        :return: As many roots of what the values are above the floor, negative below it
-        """
+        """Get what the networks learn: roots of what values relative to the offset are above the floor, negative below it."""
         above = values - self.floor
         if self.degree is not None:
             return above.sign() * above.abs().pow(1 / self.degree)
@@ -211,21 +178,11 @@ class RootCritic(LyapunovCritic):
         return above.sign() * (distances + (distances * (distances + 4 * self.scale)).sqrt()) / 2
 
     def value(self, roots: th.Tensor) -> th.Tensor:
-        """
-        Get the values that roots belong to.
-
-        :param roots: What the networks learn
-        :return: As many values relative to the offset, the inverse of ``root()``
-        """
+        """Get the values that roots belong to, relative to the offset: the inverse of ``root()``."""
         return signed_power(self.distance(roots), 2) + self.floor
 
     def distance(self, roots: th.Tensor) -> th.Tensor:
-        """
-        Get a measure of values that is like a norm where values are like its square.
-
-        :param roots: What the networks learn
-        :return: As many square roots of what the values are above the floor, negative below it
-        """
+        """Get signed square roots of what values are above the floor: like a norm, where values are like its square."""
         if self.degree is not None:
             return signed_power(roots, self.degree // 2)
         return signed_power(roots, 2) / (self.scale + roots.abs()).clamp(min=th.finfo(roots.dtype).tiny)
@@ -325,26 +282,14 @@ MlpPolicy = LyapunovPolicy
 
 
 class CnnPolicy(LyapunovPolicy):
-    """
-    Policy class (with both actor and critic) for LAC with image observations.
-
-    :param args: Arguments of ``LyapunovPolicy``
-    :param features_extractor_class: Features extractor to use.
-    :param kwargs: Arguments of ``LyapunovPolicy``
-    """
+    """``LyapunovPolicy`` for image observations, by default with ``NatureCNN``."""
 
     def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any):
         super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
 
 
 class MultiInputPolicy(LyapunovPolicy):
-    """
-    Policy class (with both actor and critic) for LAC with dictionary observations.
-
-    :param args: Arguments of ``LyapunovPolicy``
-    :param features_extractor_class: Features extractor to use.
-    :param kwargs: Arguments of ``LyapunovPolicy``
-    """
+    """``LyapunovPolicy`` for dictionary observations, by default with ``CombinedExtractor``."""
 
     def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any):
         super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)

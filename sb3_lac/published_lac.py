@@ -43,14 +43,10 @@ class SumOfSquaresCritic(LyapunovCritic):
 class PublishedPolicy(LyapunovPolicy):
     """
     Policy class (with both actor and critic) for ``PublishedLAC``: the policy of LAC with a ``SumOfSquaresCritic``, a target
-    actor, and the networks of Han et al. (2020).
+    actor, and the networks of Han et al. (2020). ``LyapunovPolicy`` describes the arguments that are not listed here.
 
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param lr_schedule: Learning rate schedule (could be constant)
     :param net_arch: Hidden layers of the actor (``pi``) and of the critic (``qf``); the critic squares its last layer
     :param n_critics: Number of Lyapunov critic networks to create, the largest of their values is used.
-    :param kwargs: The other arguments of ``LyapunovPolicy``
     """
 
     critic_class = SumOfSquaresCritic
@@ -157,37 +153,23 @@ class PublishedLAC(CostAlgorithm):
     ``lambda`` fall to zero (``LinearSchedule(rate, 0.0, 1.0)``); ``alpha3`` is 0.1; and ``lambda`` is clipped when read, so
     that its logarithm can wind up. With positive rewards, costs are those of ``LAC``.
 
+    ``LAC`` describes the arguments that are not listed here. Their defaults are those of [P] (``batch_size``, ``tau``,
+    ``target_entropy``, ``alpha3``) and of [C] (``buffer_size``, ``learning_starts``, ``train_freq``, ``gradient_steps``,
+    ``lambda_init``, ``lambda_max``; ``lambda_min`` is 0 in the code, which a logarithm does not reach).
+
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...), see ``PublishedPolicy`` for its networks [P]
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param learning_rate: learning rate of the actor and of ``ent_coef`` [P],
         it can be a function of the current progress remaining (from 1 to 0).
         A change of this rate, on a model or on loading, does not affect the rates of critic and ``lambda``.
-    :param buffer_size: size of the replay buffer [C]
-    :param learning_starts: how many steps of the model to collect transitions for before learning starts [C]
-    :param batch_size: Minibatch size for each gradient update [P]
-    :param tau: the soft update coefficient ("Polyak update", between 0 and 1) [P]
     :param gamma: the discount factor [P]. 'auto' takes the environment's. Without effect if there is a ``horizon``.
-    :param train_freq: Update the model every ``train_freq`` steps [C]
-    :param gradient_steps: How many gradient steps to do after each rollout [C]
-    :param action_noise: the action noise type (None by default)
-    :param replay_buffer_class: Replay buffer class to use. If ``None``, it will be automatically selected.
-    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer (not with a ``horizon``)
     :param ent_coef: Entropy regularization coefficient (``beta`` in the paper), 'auto_2' is learned from 2 on [C]
-    :param target_update_interval: update the target networks every ``target_update_interval`` gradient steps.
-    :param target_entropy: target entropy when learning ``ent_coef``, 'auto' is minus the number of actions [P]
-    :param alpha3: Share of the cost by which ``L`` has to decrease in each step [P]
     :param horizon: Number of costs in the plain sum ``L``, 5 in four of the paper's five tasks [P]. ``None`` is the discounted
         sum of all costs. Not with dictionary observations.
     :param critic_learning_rate: learning rate of the critic [P], it can be a function of the current progress remaining
     :param lambda_learning_rate: learning rate of ``lambda`` [C], it can be a function of the current progress remaining
-    :param lambda_init: Initial value of ``lambda`` [C]
-    :param lambda_min: Lower limit of ``lambda`` (the code has 0, which a logarithm does not reach)
-    :param lambda_max: Upper limit of ``lambda`` [C]. If ``None``, it is 1, or ``lambda_init`` if that is larger.
-    :param reward_bound: Largest reward that the environment can pay, see ``LAC``
-    :param compile_update: Whether to compile each update to one graph, see ``LAC``
     :param kwargs: The other arguments of ``LAC``; ``n_steps`` is not of the paper, and not with a ``horizon``
-    :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

@@ -131,8 +131,7 @@ class GymnasiumVecEnv(VecEnv):
         """
         chosen = self._get_indices(indices)
         if isinstance(self._single_envs, gym.vector.SyncVectorEnv):
-            methods = [self._single_envs.envs[n].get_wrapper_attr(method_name) for n in chosen]
-            return [method(*method_args, **method_kwargs) for method in methods]
+            return [method(*method_args, **method_kwargs) for method in self.get_attr(method_name, indices)]
         if self._single_envs is not None:
             self._check_attr(method_name)
             results = self._single_envs.call(method_name, *method_args, **method_kwargs)

@@ -209,14 +209,9 @@ def _entries(config: str | Path) -> dict[str, Hyperparams]:
 
 def find_config(algo: str, env_id: str | None = None) -> Path:
     """
-    Find the hyperparameters of an algorithm.
-
-    :param algo: Name of the algorithm
-    :param env_id: Id of an environment. The first file with an entry for it is taken, or else the first one with the entry
-        ``default``, of ``zoo_configs/<algo>.yml`` in the current folder, that of this package, and that of the RL Zoo. Without
-        an id it is the first one of the former two.
-    :return: The file
-    :raises FileNotFoundError: If there is none
+    Find the file of hyperparameters of an algorithm: the first one with an entry for the environment, or else the first one
+    with the entry ``default``, of ``zoo_configs/<algo>.yml`` in the current folder, that of this package, and that of the RL
+    Zoo. Without an id of an environment it is the first one of the former two.
     """
     package = Path(__file__).resolve().parent
     # In a source checkout, which an editable installation is too, the folder lies beside the package

@@ -62,12 +62,8 @@ def tensors_of(*values: Any) -> list[th.Tensor]:
 
 class Graph:
     """
-    Compiled code, as a function of all tensors that an update reads. A GPU replays it at one launch (CUDA graph) as soon as it
-    has run once on tensors that are still where they were, apart from samples.
-
-    :param function: The code
-    :param sampled: The parts of samples that the update is made with
-    :param on_gpu: Whether it runs there
+    Compiled code, as a function of all tensors that an update reads, which a GPU replays at one launch (CUDA graph) as soon as
+    it has run once on tensors that are still where they were, apart from samples.
     """
 
     def __init__(self, function: Callable[..., Sequence[th.Tensor]], sampled: Sequence[th.Tensor], on_gpu: bool) -> None:

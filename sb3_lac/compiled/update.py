@@ -36,11 +36,8 @@ _UNASKED = ("CLOSURE_MATCH", "DICT_NOT_CONTAINS", "DUPLICATE_INPUT", "HASATTR", 
 
 class CompiledUpdate:
     """
-    The update of a model as one graph without breaks. It is compiled at its first call, and again when something has changed
-    that it took for constant. That is looked at once in a call of ``train()``.
-
-    :param update: The update, a function of the model, of samples, and of what else changes from one to the next
-    :param device: Device of the model
+    The update of a model as one graph without breaks, compiled at its first call, and again when something has changed that it
+    took for constant: that is looked at once in a call of ``train()``.
     """
 
     def __init__(self, update: Callable[..., Metrics], device: th.device) -> None:

@@ -1,13 +1,10 @@
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, stated_parameters
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from sb3_lac.envs.base import Axes, CostEnv, stated_parameters
 
 
 class CartPoleCostEnv(CostEnv):
@@ -117,12 +114,11 @@ class CartPoleCostEnv(CostEnv):
         return float(cost), False
 
     def _error(self) -> float:
-        assert self.state is not None
         x, _, theta, _ = self.state.tolist()
         length = 2 * self.pole_half_length_m
         return math.hypot(x + length * math.sin(theta), length * (1.0 - math.cos(theta)))
 
-    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+    def _draw(self, axes: Axes, states: np.ndarray) -> None:
         x, _, theta, _ = states[-1]
         # The pole is five times as long as it is, to be seen on a track of 20 m
         length, track = 10.0 * self.pole_half_length_m, self.X_MAX_M

@@ -1,13 +1,10 @@
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative, stated_parameters
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from sb3_lac.envs.base import Axes, CostEnv, check_not_negative, stated_parameters
 
 
 def riccati_gain(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -104,10 +101,9 @@ class LinearCostEnv(CostEnv):
         return float(state @ self.Q @ state + control @ self.R @ control), False
 
     def _error(self) -> float:
-        assert self.state is not None
         return math.hypot(*self.state)
 
-    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+    def _draw(self, axes: Axes, states: np.ndarray) -> None:
         reach = max(1.3, 1.1 * float(np.abs(states).max()))
         axes.set(xlim=(-1.33 * reach, 1.33 * reach), ylim=(-reach, reach))
         axes.axhline(color="0.8")

@@ -1,12 +1,9 @@
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, stated_parameters
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from sb3_lac.envs.base import Axes, CostEnv, stated_parameters
 
 
 class OscillatorEnv(CostEnv):
@@ -94,17 +91,13 @@ class OscillatorEnv(CostEnv):
         super().__init__(parameters, np.zeros(6), np.full(6, self.STATE_MAX), observation_space, n_actions=3, **options)
 
     def reference(self, step: int) -> float:
-        """
-        :param step: Steps since the start
-        :return: What the first protein should be
-        """
+        """Return what the first protein should be so many steps after the start."""
         return 8.0 + 7.0 * float(np.sin(2.0 * np.pi * step / self.PERIOD_STEPS))
 
     def _initial_state(self) -> np.ndarray:
         return self.np_random.uniform(0.0, 5.0, 6)
 
     def _observation(self) -> np.ndarray:
-        assert self.state is not None
         return np.array([*self.state, self.reference(self.n_steps), self.reference(self.n_steps + 1)], dtype=np.float32)
 
     def next_state(self, state: np.ndarray, action: np.ndarray, push: float) -> np.ndarray:
@@ -119,10 +112,9 @@ class OscillatorEnv(CostEnv):
         return float((next_state[3] - self.reference(self.n_steps + 1)) ** 2), False
 
     def _error(self) -> float:
-        assert self.state is not None
         return abs(float(self.state[3]) - self.reference(self.n_steps))
 
-    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+    def _draw(self, axes: Axes, states: np.ndarray) -> None:
         axes.set(xlim=(-1.0, 15.5), ylim=(-4.5, 17.5), aspect="auto")
         # The ring of proteins, each of which represses the next; their areas are the concentrations
         places, present = [(3.9, 13.0), (6.6, 1.5), (1.2, 1.5)], self.n_steps

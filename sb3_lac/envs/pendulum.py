@@ -1,15 +1,11 @@
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, check_not_negative, stated_parameters
-from sb3_lac.envs.integration import runge_kutta_step
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from sb3_lac.envs.base import Axes, CostEnv, check_not_negative, runge_kutta_step, stated_parameters
 
 
 class PendulumCostEnv(CostEnv):
@@ -105,7 +101,6 @@ class PendulumCostEnv(CostEnv):
         return self.np_random.uniform(-1.0, 1.0, 2) * (math.pi, 1.0)
 
     def _observation(self) -> np.ndarray:
-        assert self.state is not None
         theta, speed = self.state.tolist()
         return np.array([math.cos(theta), math.sin(theta), speed], dtype=np.float32)
 
@@ -131,10 +126,9 @@ class PendulumCostEnv(CostEnv):
         return theta**2 + 0.1 * speed**2 + 0.01 * torque**2, False
 
     def _error(self) -> float:
-        assert self.state is not None
         return abs(float(self.state[0]))
 
-    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+    def _draw(self, axes: Axes, states: np.ndarray) -> None:
         reach = 1.25 * self.length_m
         axes.set(xlim=(-1.33 * reach, 1.33 * reach), ylim=(-reach, reach))
         x, z = self.length_m * np.sin(states[:, 0]), self.length_m * np.cos(states[:, 0])

@@ -1,15 +1,11 @@
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, stated_parameters
-from sb3_lac.envs.integration import runge_kutta_step
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from sb3_lac.envs.base import Axes, CostEnv, runge_kutta_step, stated_parameters
 
 
 class QuadrotorCostEnv(CostEnv):
@@ -131,10 +127,9 @@ class QuadrotorCostEnv(CostEnv):
         return position * (x**2 + z**2) + pitch * phi**2 + effort * (left**2 + right**2), False
 
     def _error(self) -> float:
-        assert self.state is not None
         return math.hypot(self.state[0], self.state[1])
 
-    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+    def _draw(self, axes: Axes, states: np.ndarray) -> None:
         limit = self.POSITION_MAX_M
         axes.set(xlim=(-1.47 * limit, 1.47 * limit), ylim=(-1.1 * limit, 1.1 * limit))
         axes.plot(limit * np.array([-1, 1, 1, -1, -1]), limit * np.array([-1, -1, 1, 1, -1]), color="0.8", linestyle="--")

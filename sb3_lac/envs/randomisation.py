@@ -14,13 +14,7 @@ Ranges = Mapping[str, Sequence[float]]
 
 
 class Randomisation:
-    """
-    Numbers that each episode has anew, uniformly and independently distributed.
-
-    :param ranges: Smallest and largest value of each, by name
-    :param present: The present values of what can be randomised. Where one is a whole number, and both ends are, whole
-        numbers are sampled, the ends among them
-    """
+    """Numbers that each episode samples anew, uniformly and independently, each within its range."""
 
     def __init__(self, ranges: Ranges, present: Mapping[str, float]) -> None:
         if unknown := ranges.keys() - present.keys():
@@ -31,6 +25,7 @@ class Randomisation:
                 raise ValueError(f"drawn[{name!r}]={ends!r} must be the smallest and the largest value, two finite numbers.")
         #: All of them at their smallest, and at their largest
         self.smallest, self.largest = ({name: ends[end] for name, ends in ranges.items()} for end in (0, 1))
+        # Where the present value and both ends are whole numbers, so are those that are sampled, the ends among them
         self._is_whole = {
             name: isinstance(present[name], Integral) and all(float(end).is_integer() for end in ends)
             for name, ends in ranges.items()

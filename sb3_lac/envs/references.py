@@ -7,7 +7,6 @@ They know the problem by its equations and nominal parameters, and see what a po
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from typing import Any
 
 import gymnasium as gym
@@ -34,21 +33,27 @@ def _linearised(model: CostEnv, at_rest: float = 0.0) -> tuple[np.ndarray, np.nd
     return np.array(columns[:n]).T, np.array(columns[n:]).T
 
 
-class ReferenceController(ABC):
+class ReferenceController:
     """
-    A controller with the ``predict()`` of a model of Stable-Baselines3, without memory or randomness.
+    A controller with the ``predict()`` of a model of Stable-Baselines3, without memory or randomness: a linear one, unless a
+    subclass says otherwise.
 
     :param model: The nominal problem, without disturbances
     """
+
+    #: Actions per observation, towards the goal
+    gain: np.ndarray
+    #: Action that keeps the goal
+    at_rest = 0.0
 
     def __init__(self, model: CostEnv) -> None:
         self.observation_space, self.action_space = model.observation_space, model.action_space
         assert model.observation_space.shape is not None
         self._n_seen = model.observation_space.shape[0]
 
-    @abstractmethod
     def _actions(self, observations: np.ndarray) -> np.ndarray:
         """The actions for a batch of observations, not yet limited."""
+        return self.at_rest - observations @ self.gain.T
 
     def predict(
         self,
@@ -89,9 +94,6 @@ class LinearController(ReferenceController):
         super().__init__(model)
         self.gain = model.optimal_gain() / model.control_max
 
-    def _actions(self, observations: np.ndarray) -> np.ndarray:
-        return -observations @ self.gain.T
-
 
 class CartPoleController(ReferenceController):
     """
@@ -103,9 +105,6 @@ class CartPoleController(ReferenceController):
         super().__init__(model)
         a, b = _linearised(model)
         self.gain = riccati_gain(a, b, np.diag([0.03, 0.0, 10.0, 0.0]), np.eye(1))
-
-    def _actions(self, observations: np.ndarray) -> np.ndarray:
-        return -observations @ self.gain.T
 
 
 class OscillatorController(ReferenceController):
@@ -164,13 +163,10 @@ class QuadrotorController(ReferenceController):
 
     def __init__(self, model: QuadrotorCostEnv) -> None:
         super().__init__(model)
-        self.hover = model.mass_kg * model.GRAVITY_M_S2 / model.rotor_force_max_N - 1.0
-        a, b = _linearised(model, self.hover)
+        self.at_rest = model.mass_kg * model.GRAVITY_M_S2 / model.rotor_force_max_N - 1.0
+        a, b = _linearised(model, self.at_rest)
         position, pitch, effort = model.WEIGHTS
         self.gain = riccati_gain(a, b, np.diag([position, position, pitch, 0.0, 0.0, 0.0]), effort * np.eye(2))
-
-    def _actions(self, observations: np.ndarray) -> np.ndarray:
-        return self.hover - observations @ self.gain.T
 
 
 class VehicleController(ReferenceController):

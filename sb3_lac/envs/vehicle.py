@@ -1,15 +1,11 @@
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_lac.envs.base import CostEnv, stated_parameters
-from sb3_lac.envs.integration import runge_kutta_step
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from sb3_lac.envs.base import Axes, CostEnv, runge_kutta_step, stated_parameters
 
 
 class VehicleCostEnv(CostEnv):
@@ -146,10 +142,7 @@ class VehicleCostEnv(CostEnv):
                 raise ValueError(f"{name}={parameters[name]} must be at most {largest:.4g}.")
 
     def curvature(self, distance_m: float) -> float:
-        """
-        :param distance_m: Distance s along the path
-        :return: Curvature of the path in 1/m
-        """
+        """Return the curvature of the path in 1/m, at a distance along it in m."""
         return self.PATH_CURVATURE_1_m * math.sin(math.tau * distance_m / self.PATH_PERIOD_M)
 
     def _initial_state(self) -> np.ndarray:
@@ -158,7 +151,6 @@ class VehicleCostEnv(CostEnv):
         return start
 
     def _observation(self) -> np.ndarray:
-        assert self.state is not None
         *moving, distance = self.state.tolist()
         curvature, ahead = self.curvature(distance), self.curvature(distance + self.PREVIEW_M)
         return np.array([*moving, self.speed_m_s * curvature, self.speed_m_s * ahead], dtype=np.float32)
@@ -205,10 +197,9 @@ class VehicleCostEnv(CostEnv):
         return offset_weight * offset**2 + course_weight * course**2 + turn_weight * turn**2, False
 
     def _error(self) -> float:
-        assert self.state is not None
         return abs(float(self.state[0]))
 
-    def _draw(self, axes: "Axes", states: np.ndarray) -> None:
+    def _draw(self, axes: Axes, states: np.ndarray) -> None:
         # The car from above, on a piece of the path around it; points of the plane are complex numbers
         offset, heading, _, _, steering, distance_m = states[-1]
         distances = math.floor(distance_m) + np.arange(-20.0, 45.0, 0.25)

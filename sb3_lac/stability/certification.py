@@ -45,8 +45,8 @@ class CertificationReport:
         true ones, their ``share``, and ``at_least``, the lower bound of the probability
     :param transitions: One row per transition of those episodes: ``episode``, ``step``, ``reward``, ``cost``, ``terminated``,
         ``lyapunov`` if there is a function, and others
-    :param episodes: One row per episode: ``length``, ``total_cost``, ``final_cost``, ``largest_late_cost``, ``terminated``,
-        and one column per statement: 1 if true, 0 if not, NaN if the episode does not count
+    :param episodes: One row per episode, as in ``LyapunovReport``, and one column per statement: 1 if true, 0 if not, NaN if
+        the episode does not count
     :param starts: One row per initial state on the grid: ``state_0`` and so on, ``n_episodes``, ``n_attracted``, their
         ``share`` with its exact interval ``low`` and ``high``; None without given initial states
     :param ultimate_bound: The cost to stay within, None if there is none

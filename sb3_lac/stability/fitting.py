@@ -13,6 +13,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
+from tqdm import tqdm
 
 from sb3_lac.stability.functions import LyapunovFunction, Observations
 from sb3_lac.stability.loop import by_keyword, closed_loop
@@ -36,11 +37,7 @@ WINDOWS = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
 class SumOfSquares(nn.Module):
-    """
-    A network that is never negative: the sum of the squares of its last layer.
-
-    :param n_inputs: Number of inputs
-    """
+    """A network that is never negative: the sum of the squares of its last layer."""
 
     def __init__(self, n_inputs: int):
         super().__init__()
@@ -58,16 +55,10 @@ class SumOfSquares(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class InputRange:
-    """
-    The numbers that observations were made of on the roll-outs of a fit, each of shape (n_inputs,).
-
-    :param mean: Mean
-    :param scale: Standard deviation, infinite for a number that never changed, which nothing is known of
-    :param low: Least value
-    :param high: Largest value
-    """
+    """The numbers that observations were made of on the roll-outs of a fit, each of shape (n_inputs,)."""
 
     mean: np.ndarray
+    #: Standard deviation, infinite for a number that never changed, which nothing is known of
     scale: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -253,8 +244,6 @@ class _Data:
 
 def _learn(network: SumOfSquares, data: _Data, reward_bound: float, seed: int, progress_bar: bool) -> float:
     """Fit a network to the returns, and return the average cost."""
-    from tqdm import tqdm  # only a fit needs it
-
     costs, n = data.costs, len(data.costs)
     rng = np.random.default_rng(seed)
     optimizer = th.optim.Adam(network.parameters(), lr=LEARNING_RATE)

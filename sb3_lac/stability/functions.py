@@ -107,12 +107,7 @@ class LyapunovFunction:
 
     @contextmanager
     def in_units_of(self, vec_normalize: VecNormalize | None) -> Iterator[float]:
-        """
-        Let values and costs have the units of the rewards that are judged.
-
-        :param vec_normalize: Wrapper that these rewards come from, if any
-        :return: The reward that costs nothing, in these units
-        """
+        """Let values and costs have the units of the rewards that are judged, and yield the one that costs nothing."""
         yield self.reward_bound or 0.0
 
 
@@ -140,10 +135,11 @@ class CriticLyapunov(LyapunovFunction):
     @contextmanager
     def in_units_of(self, vec_normalize: VecNormalize | None) -> Iterator[float]:
         offset = self.model.critic.offset.clone()
+        bound = self.model.bound_in(vec_normalize)
         # The scale of normalized rewards may have changed since the last update
-        self.model.update_offset(vec_normalize)
+        bound.update_offset()
         try:
-            yield self.model.cost_bound(vec_normalize).item()
+            yield bound.value.item()
         finally:
             # A report changes nothing of the model
             for critic in (self.model.critic, self.model.critic_target):

@@ -44,12 +44,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def by_keyword(function: Function) -> Function:
-    """
-    Accept arguments by their places and names of 0.6 too, with a warning that says what to write.
-
-    :param function: A function whose keyword-only arguments stand in the order of their old places
-    :return: The function for both forms
-    """
+    """Accept keyword-only arguments, in the order of their old places, by places and names of 0.6 too, with a warning."""
     parameters = inspect.signature(function).parameters.values()
     names = [parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
     n_places = len(parameters) - len(names)
@@ -74,22 +69,16 @@ def by_keyword(function: Function) -> Function:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """
-    A policy in an environment, ready to be rolled out.
-
-    :param policy: The policy
-    :param env: The environment as the policy sees it
-    :param lyapunov: Function whose values are of interest, if any
-    :param reward_bound: The reward that costs nothing, in the units of the rewards that are judged
-    :param deterministic: Whether the loop is that of the mean action
-    :param seed: Seed of the environments, the second one has the next one
-    """
+    """A policy in an environment as it sees it, ready to be rolled out, and the function whose values are of interest."""
 
     policy: PolicyPredictor
     env: VecEnv
     lyapunov: LyapunovFunction | None
+    #: The reward that costs nothing, in the units of the rewards that are judged
     reward_bound: float
+    #: Whether the loop is that of the mean action
     deterministic: bool
+    #: Of the first environment; the second one has the next one
     seed: int
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -45,18 +45,6 @@ def set_log_scale(axes: Axes, axis_name: Literal["x", "y"], values: pd.Series | 
     if is_wide(values):
         axes.set(**{f"{axis_name}scale": "log"})
         format_log_axis(axes.xaxis if axis_name == "x" else axes.yaxis)
-
-
-def project(states: np.ndarray, x: int, y: int, names: Sequence[str] | None) -> tuple[np.ndarray, dict[str, Any]]:
-    """Two dimensions of states, and the labels of their axes."""
-    n_dims = states.shape[1]
-    if not (0 <= x < n_dims and 0 <= y < n_dims):
-        raise ValueError(f"x={x} and y={y} must lie between 0 and {n_dims - 1}, the states have {n_dims} dimensions.")
-    if names is None:
-        names = [f"state {k}" for k in range(n_dims)]
-    if len(names) != n_dims:
-        raise ValueError(f"names={list(names)} must name all {n_dims} dimensions of the states.")
-    return states[:, [x, y]], {"xlabel": names[x], "ylabel": names[y]}
 
 
 def draw_episodes(transitions: pd.DataFrame, axes: Axes) -> None:
@@ -188,7 +176,14 @@ def plot_certification(
 def plot_region_of_attraction(starts: pd.DataFrame, x: int, y: int, names: Sequence[str] | None) -> Figure:
     """See ``CertificationReport.plot_region_of_attraction()``."""
     states = starts[[column for column in starts if str(column).startswith("state_")]].to_numpy()
-    points, labels = project(states, x, y, names)
+    n_dims = states.shape[1]
+    if not (0 <= x < n_dims and 0 <= y < n_dims):
+        raise ValueError(f"x={x} and y={y} must lie between 0 and {n_dims - 1}, the states have {n_dims} dimensions.")
+    if names is None:
+        names = [f"state {k}" for k in range(n_dims)]
+    if len(names) != n_dims:
+        raise ValueError(f"names={list(names)} must name all {n_dims} dimensions of the states.")
+    points = states[:, [x, y]]
     figure = new_figure(5.8, 4.8)
     axes = figure.subplots()
     # The worst of those that differ in other dimensions
@@ -205,5 +200,6 @@ def plot_region_of_attraction(starts: pd.DataFrame, x: int, y: int, names: Seque
     if never.any():
         # Beside the axes: a grid of starts leaves no room in a corner
         figure.legend(fontsize=8, loc="outside lower center")
-    axes.set(title=f"{len(points)} start states, {starts['n_episodes'].iloc[0]} episodes each", **labels)
+    title = f"{len(points)} start states, {starts['n_episodes'].iloc[0]} episodes each"
+    axes.set(title=title, xlabel=names[x], ylabel=names[y])
     return figure

@@ -44,18 +44,13 @@ def flatten(observations: Observations) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class RollOuts:
-    """
-    Roll-outs of a policy, one episode after the other.
+    """Roll-outs of a policy, one episode after the other, with one observation and one action per transition."""
 
-    :param transitions: One row per transition with ``episode``, ``step``, ``reward``, ``truncated`` and ``terminated``
-    :param observations: In which the actions were taken
-    :param actions: One per transition
-    :param last_observations: After the time limits, one per episode that was truncated, or None if none was
-    """
-
+    #: With columns ``episode``, ``step``, ``reward``, ``truncated`` and ``terminated``
     transitions: pd.DataFrame
     observations: Observations
     actions: np.ndarray
+    #: After the time limits, one per episode that was truncated, or None if none was
     last_observations: Observations | None
 
     def vectors(self) -> np.ndarray | None:

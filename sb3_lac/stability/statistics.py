@@ -48,8 +48,6 @@ class Bootstrap:
     Samples in which a statistic is not defined, as a ratio to a cost of 0, are left out, and if they are more than the 2.5 %
     beyond an end of the interval, there is none: it takes some four episodes with data. ``scipy.stats.bootstrap`` would give
     no interval wherever one sample is not defined.
-
-    :param n_episodes: Number of episodes
     """
 
     def __init__(self, n_episodes: int):

@@ -161,7 +161,7 @@ def test_normalized_costs_of_a_horizon_are_summed_in_units_of_the_agent(make_mod
     costs = model.costs(batch)
     targets = model._candidate(batch, costs)
     assert (targets >= costs - 1e-5).all()
-    th.testing.assert_close(targets, 3 * model.cost_bound(env) - batch.horizon_rewards)
+    th.testing.assert_close(targets, 3 * model.bound_in(env).value - batch.horizon_rewards)
 
 
 @pytest.mark.parametrize(
