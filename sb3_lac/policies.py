@@ -146,20 +146,17 @@ class RootCritic(LyapunovCritic):
         self.scale: th.Tensor
         self.register_buffer("floor", th.zeros(1))
         self.register_buffer("scale", th.zeros(1))
-
-    def get_extra_state(self) -> th.Tensor:
-        """Weights are of one root, which goes with them into files; 0 stands for the mixed one."""
-        return th.tensor(self.degree or 0)
-
-    def set_extra_state(self, state: th.Tensor) -> None:
-        self.degree = int(state) or None
+        # Weights are of one root, which goes with them into files; 0 stands for the mixed one
+        self.register_buffer("root_degree", th.tensor([float(self.degree or 0)]))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         # Weights of before sb3_lac 0.7 go with no root: that of the arguments, which came later, or else the fourth
-        state_dict.setdefault(f"{prefix}_extra_state", th.tensor(self._degree_of_old_weights))
+        degree = state_dict.pop(f"{prefix}_extra_state", self._degree_of_old_weights)
+        state_dict.setdefault(f"{prefix}root_degree", th.tensor([float(degree)]))
         # One root everywhere has no scale
         state_dict.setdefault(f"{prefix}scale", th.zeros(1))
         super()._load_from_state_dict(state_dict, prefix, *args)
+        self.degree = int(state_dict[f"{prefix}root_degree"]) or None
 
     def follow(self, values: th.Tensor, rate: float) -> None:
         """Move the floor to the lowest value, and the scale to a tenth of the mean distance, by a share of the way."""

@@ -190,9 +190,16 @@ def test_one_that_is_no_root_is_refused_and_roots_are_of_lac_alone(make_model):
 @pytest.mark.parametrize(("stated", "root"), [({}, 4), ({"root": None}, 4), ({"root": 2}, 2), ({"root": 4}, 4)])
 def test_weights_that_go_with_no_root_are_of_the_fourth_unless_one_was_stated(stated, root, make_model):
     model = make_model(n_collect=0, policy_kwargs=stated)
-    weights = {name: value for name, value in model.policy.state_dict().items() if not name.endswith("_extra_state")}
+    weights = {name: value for name, value in model.policy.state_dict().items() if not name.endswith("root_degree")}
     model.policy.load_state_dict(weights)
     assert model.critic.degree == model.critic_target.degree == root
     other = make_model(n_collect=0)
     other.policy.load_state_dict(model.policy.state_dict())
     assert other.critic.degree == root
+
+
+def test_any_numbers_load_as_weights_as_into_policies_of_sb3(make_model):
+    policy = make_model(n_collect=0).policy
+    drawn = {name: th.rand_like(value) for name, value in policy.state_dict().items()}
+    policy.load_state_dict(drawn)
+    assert all(th.equal(value, drawn[name]) for name, value in policy.state_dict().items())

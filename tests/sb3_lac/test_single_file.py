@@ -20,7 +20,7 @@ def weights_of(model):
     """Those of a model of Stable-Baselines3, under the names of the single file."""
     weights = {f"actor.{name}": tensor for name, tensor in model.actor.state_dict().items()}
     for name, critic in (("critic", model.critic), ("critic_target", model.critic_target)):
-        own = {key: tensor for key, tensor in critic.state_dict().items() if key not in ("offset", "_extra_state")}
+        own = {key: tensor for key, tensor in critic.state_dict().items() if key not in ("offset", "root_degree")}
         parts = {key.replace("lf", "networks.", 1): tensor for key, tensor in own.items()}
         weights |= {f"{name}.{key}": tensor for key, tensor in parts.items()}
     weights |= {"log_lambda": model.log_lambda.detach(), "log_ent_coef": model.log_ent_coef.detach()}

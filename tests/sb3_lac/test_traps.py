@@ -130,7 +130,7 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
             "offset",
             "floor",
             "scale",
-            "_extra_state",
+            "root_degree",
         }
         optimized = [parameter for group in module.optimizer.param_groups for parameter in group["params"]]
         assert {id(parameter) for parameter in optimized} == {id(parameter) for parameter in module.parameters()}
@@ -139,7 +139,7 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
     unchanged = {name for name, tensor in model.policy.state_dict().items() if th.equal(before[name], tensor)}
     # Some wait for positive rewards, and a root stays
     waiting = {"critic.offset", "critic_target.offset", "reward_bound"}
-    assert unchanged == waiting | {"critic._extra_state", "critic_target._extra_state"}
+    assert unchanged == waiting | {"critic.root_degree", "critic_target.root_degree"}
 
 
 def test_entropy_coefficient_and_target_can_be_written_as_text(make_model):
