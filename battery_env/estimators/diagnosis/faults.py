@@ -174,7 +174,7 @@ class MeasuredSamples:
                 break
             if switch is None:
                 # the last row before a switch may already have the voltage after it
-                reference_V = self.smoothed_V[max(row - 2, 0) : row]
+                reference_V = self.voltage_V[max(row - 2, 0) : row]
                 switch = _Switch(row, 0.0, 0.0, float(reference_V.max() if change_A[row] > 0.0 else reference_V.min()))
                 switched_s.append(float(time_s[row]))
             else:
