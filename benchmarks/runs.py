@@ -195,7 +195,7 @@ class Run:
             elif isinstance(value, list):
                 settings[name] = tuple(value)  # of steps or episodes between updates
             elif name in ("policy_kwargs", "replay_buffer_kwargs"):
-                settings[name] = _evaluated(value)
+                settings[name] = dict(_evaluated(value))  # algorithms write into it
         if (noise := settings.pop("noise_type", None)) is not None:
             n_actions = gym.spaces.flatdim(env.action_space)
             std = np.full(n_actions, settings.pop("noise_std"))
