@@ -30,7 +30,6 @@ from benchmarks.contests import HELD_OUT, SENSORS
 from benchmarks.runs import Run, made_by, train_or_load
 from benchmarks.study import (
     SYMBOLS,
-    Cell,
     Study,
     Tables,
     at_most,
@@ -38,7 +37,6 @@ from benchmarks.study import (
     markdown,
     natural,
     positive,
-    row_by_row,
     versions,
 )
 from benchmarks.zoo_runs import zoo_run
@@ -118,15 +116,20 @@ def card_of(run: Run, scores: pd.DataFrame, command: str, minutes: float) -> dic
 
 def summary_text(table: pd.DataFrame) -> str:
     """The summary for readers."""
-    cells: dict[str, Cell] = {
-        "environment": "{env_id}",
-        "constants off by": "{mismatch:g}",
-        "sensor": "{sensor}",
-        "parameter": ("parameter", SYMBOLS.__getitem__),
-        "mean ± sd (worst) error, second half (%)": "{mean_percent:.2f} ± {sd_percent:.2f} ({worst_percent:.1f})",
-        "last estimate (%)": "{final_percent:.2f}",
-    }
-    return markdown(row_by_row(table, cells))
+    rows = []
+    for row in table.itertuples():
+        error = f"{row.mean_percent:.2f} ± {row.sd_percent:.2f} ({row.worst_percent:.1f})"
+        rows.append(
+            {
+                "environment": row.env_id,
+                "constants off by": f"{row.mismatch:g}",
+                "sensor": row.sensor,
+                "parameter": SYMBOLS[str(row.parameter)],
+                "mean ± sd (worst) error, second half (%)": error,
+                "last estimate (%)": f"{row.final_percent:.2f}",
+            }
+        )
+    return markdown(rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
