@@ -111,19 +111,12 @@ def training_file(parameter: Parameter, out: Path) -> Path:
 
 
 class Pairs(NamedTuple):
-    """
-    Labelled pairs.
+    """Labelled pairs of consecutive states without the temperature."""
 
-    :param before: x_t, states without the temperature, shape (n, 7)
-    :param after: x_{t+1}, shape (n, 7)
-    :param load_W: u_{t+1}, the power over that second, shape (n,)
-    :param label: the true parameter, C or ohm, shape (n,)
-    """
-
-    before: FloatArray
-    after: FloatArray
-    load_W: FloatArray
-    label: FloatArray
+    before: FloatArray  # x_t, shape (n, 7)
+    after: FloatArray  # x_{t+1}, shape (n, 7)
+    load_W: FloatArray  # u_{t+1}, the power over that second, shape (n,)
+    label: FloatArray  # the true parameter, C or ohm, shape (n,)
 
 
 def draw_pairs(data: TrajectoryDataset, parameter: Parameter, n: int, seed: int) -> Pairs:
@@ -155,16 +148,7 @@ class _Scale:
 
 
 class DirectMapping(Estimator):
-    """
-    The paper's rival: a network that is taught, with labels, to tell the parameter from two consecutive states and the load
-    between them. It has the policy's layers, activations, optimizer and learning rate, and no memory.
-
-    :param normalised: whether inputs and labels are shifted and scaled to mean 0 and standard deviation 1
-    :param parameter: what it tells; the other one is known
-    :param pairs: to learn from
-    :param epochs: how often each pair is shown
-    :param seed: of first weights and order
-    """
+    """The paper's rival: the policy's network, taught with labels to tell a parameter from two consecutive states."""
 
     def __init__(self, normalised: bool, parameter: Parameter, pairs: Pairs, epochs: int, seed: int) -> None:
         self.parameter = parameter

@@ -120,10 +120,8 @@ def difference(scores: np.ndarray, rival_scores: np.ndarray, axis: int = -1) -> 
 
 def improvement(*scores: np.ndarray, axis: int = -1) -> np.ndarray:
     """
-    The probability that one of our scores is above one of the others', mean over tasks, where equal ones are half above
-    (Agarwal et al. 2021).
-
-    :param scores: ours and the others' of a task, then of the next
+    The probability that one of our scores is above one of the others' (Agarwal et al. 2021), mean over tasks, of ours and the
+    others' scores of each task in turn.
     """
     of_tasks = []
     for own_scores, rival_scores in zip(scores[::2], scores[1::2], strict=True):
