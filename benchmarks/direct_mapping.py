@@ -24,6 +24,7 @@ import numpy as np
 import pandas as pd
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
 from battery_env.arrays import FloatArray
@@ -67,7 +68,7 @@ MAPPINGS = {"raw": "direct mapping, raw (the paper's)", "normalised": "direct ma
 ENV_IDS: dict[str, str] = {"q_mobile": "BatteryQmax-v0", "r_o": "BatteryRo-v0"}
 
 # The paper's network and optimizer; it does not name the size of a batch
-_LAYERS = (256, 256, 256)
+_LAYERS = [256, 256, 256]
 _LEARNING_RATE = 5e-4
 _BATCH_SIZE = 64
 # Pairs that go through the network at once when it is used
@@ -155,12 +156,7 @@ class DirectMapping(Estimator):
         inputs, labels = _inputs(pairs), pairs.label[:, None]
         self._inputs, self._labels = (_Scale(values, normalised) for values in (inputs, labels))
         th.manual_seed(seed)
-        layers: list[nn.Module] = []
-        width = inputs.shape[1]
-        for size in _LAYERS:
-            layers += [nn.Linear(width, size), nn.LeakyReLU()]
-            width = size
-        self.network = nn.Sequential(*layers, nn.Linear(width, 1))
+        self.network = nn.Sequential(*create_mlp(inputs.shape[1], 1, _LAYERS, nn.LeakyReLU))
         self._fit(self._inputs.to_tensor(inputs), self._labels.to_tensor(labels), epochs)
 
     def _fit(self, inputs: th.Tensor, labels: th.Tensor, epochs: int) -> None:

@@ -61,8 +61,9 @@ from sb3_lac.vec_env import steps_as_one_batch
 
 #: A policy is judged so often while it is trained, at even distances, of which the last is the end.
 POINTS = 10
-#: The column of the last time.
-AT_THE_END = "after_100_percent"
+#: The column of each time, by percent of the training, and of the last one.
+CURVE = {100 * point // POINTS: f"after_{100 * point // POINTS}_percent" for point in range(1, POINTS + 1)}
+AT_THE_END = CURVE[100]
 #: What is lost at most when a training is killed.
 CHECKPOINT_EVERY_S = 120.0
 #: Packages that are known by their release, and not by their files.
@@ -407,7 +408,7 @@ class Trainer:
         machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
         provenance = {"minutes": progress.seconds / 60.0, "resumed": progress.resumed, "machine": machine}
         provenance["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
-        curve = {f"after_{100 * point // POINTS}_percent": value for point, value in enumerate(progress.curve, 1)}
+        curve = dict(zip(CURVE.values(), progress.curve, strict=False))
         row = {**run.key, **curve, **(self.describe(model, run) if self.describe else {}), **provenance}
         Rows(self.folder).add(pd.DataFrame([row]))
         progress.file.unlink(missing_ok=True)
