@@ -38,7 +38,7 @@ from battery_env.policies.pretrained import pretrained_card
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.contests import HELD_OUT, SENSORS
+from benchmarks.contests import HELD_OUT, SENSORS, rows_of_parameters
 from benchmarks.kalman_filter import PlainKalmanFilter
 from benchmarks.pretrained import OPTIONS
 from benchmarks.study import (
@@ -331,14 +331,8 @@ def parts(name: str, n: int) -> list[dict[str, Any]]:
 
 
 def by_parameter(scores: pd.DataFrame, labels: Iterable[str], unknown: Sequence[str] = PARAMETER_NAMES) -> pd.DataFrame:
-    """Scores as ``evaluate`` gives them, with a row for each parameter."""
-    tables = [
-        scores.rename(columns=lambda column, name=name: column.removeprefix(f"{name}_")).assign(
-            parameter=name, true=scores[name]
-        )
-        for name in unknown
-    ]
-    return pd.concat(tables, ignore_index=True)[["calibrator", *labels, "parameter", *_MEASURES]]
+    """What is published of scores, with a row for each parameter."""
+    return rows_of_parameters(scores, unknown)[["calibrator", *labels, "parameter", *_MEASURES]]
 
 
 def summary(results: pd.DataFrame, labels: Sequence[str], needs: Mapping[str, str]) -> pd.DataFrame:

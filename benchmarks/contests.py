@@ -79,6 +79,15 @@ def held_out_trajectories(env_id: str) -> TrajectoryDataset:
     return data
 
 
+def rows_of_parameters(scores: pd.DataFrame, parameters: Sequence[str]) -> pd.DataFrame:
+    """Scores as ``evaluate`` gives them, with a row for each parameter."""
+    tables = []
+    for name in parameters:
+        of_name = scores.rename(columns=lambda column, name=name: column.removeprefix(f"{name}_"))
+        tables.append(of_name.assign(parameter=name, true=scores[name]))
+    return pd.concat(tables)
+
+
 class Contest(ABC):
     """Scores by which algorithms are compared in one kind of environment."""
 

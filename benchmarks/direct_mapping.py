@@ -37,6 +37,7 @@ from battery_env.parameters import PARAMETER_NAMES
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.tasks.full_state.layout import LITERAL, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
+from benchmarks.contests import rows_of_parameters
 from benchmarks.runs import train_or_load
 from benchmarks.study import (
     SYMBOLS,
@@ -203,21 +204,11 @@ def scores(estimator: Estimator, parameter: Parameter, division: str, method: st
     """Score a calibrator on the test part of a division."""
     test = divided(parameter, division)[1]
     scores_of_test = evaluate(estimator, test.subset(range(0, len(test), max(len(test) // TEST_DISCHARGES, 1))))
-    columns = {
-        "load_W": "load",
-        "true": parameter,
-        "inferred": f"{parameter}_hat",
-        "mape_percent": f"{parameter}_mape_percent",
-        "final_error_percent": f"{parameter}_final_error_percent",
-        "worst": f"{parameter}_worst",
-        "bias": f"{parameter}_bias",
-        "spread": f"{parameter}_spread",
-        "time_per_estimate_s": "time_per_update_s",
-    }
-    table = pd.DataFrame({name: scores_of_test[column] for name, column in columns.items()})
-    for name, value in (("seed", seed), ("division", division), ("parameter", parameter), ("method", method)):
-        table.insert(0, name, value)
-    return {"direct_mapping": table}
+    shown = {"load": "load_W", "hat": "inferred", "time_per_update_s": "time_per_estimate_s"}
+    rows = rows_of_parameters(scores_of_test, [parameter]).rename(columns=shown)
+    columns = ["method", "parameter", "division", "seed", "load_W", "true", "inferred", "mape_percent", "final_error_percent"]
+    columns += ["worst", "bias", "spread", "time_per_estimate_s"]
+    return {"direct_mapping": rows.assign(method=method, division=division, seed=seed)[columns]}
 
 
 def mapping_part(kind: str, parameter: Parameter, division: str, seed: int, pairs: int, epochs: int) -> Tables:
