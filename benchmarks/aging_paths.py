@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -142,12 +143,9 @@ def run_of(algo: str, cells: Sequence[str], seed: int, folder: Path) -> Run:
     return zoo_run(algo, ENV_ID, seed, updates=UPDATES, differing=own)
 
 
-def training(algo: str, lives: Sequence[str], seed: int, folder: Path) -> Tables:
+def train(algo: str, lives: Sequence[str], seed: int, folder: Path) -> None:
     """Train one policy, unless that has been done."""
-    run = run_of(algo, lives, seed, folder)
-    train_or_load(run, folder / "models")
-    minutes = made_by(run, folder / "models")["training_minutes"]
-    return {"trainings": pd.DataFrame([{"algo": algo, "lives": " ".join(lives), "seed": seed, "minutes": minutes}])}
+    train_or_load(run_of(algo, lives, seed, folder), folder / "models")
 
 
 def part(judged: str, every: int, folder: Path, method: str | None = None, **policies: Any) -> Tables:
@@ -342,10 +340,7 @@ def plot(rows: pd.DataFrame) -> Figure:
 
 
 def export(seeds: Sequence[int], folder: Path, command: str, scores: pd.DataFrame) -> None:
-    """
-    Train LAC along the paths of all bundled cells, and write its seeds as one file with its card. The scores on this are those
-    of policies that learned along the path of one cell and were judged on the other.
-    """
+    """Train LAC along the paths of all cells, and write its seeds as one file with its card, and scores on the other cell."""
     path, _ = path_of(BUNDLED_CELLS, folder)
     runs = [run_of("lac", BUNDLED_CELLS, seed, folder) for seed in seeds]
     models = [train_or_load(run, folder / "models") for run in runs]
@@ -375,15 +370,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--export", action="store_true", help="write the policy that comes with the package")
     study = Study(parser, arguments)
     chosen = study.chosen
-    runs = [
-        {"algo": algo, "lives": [life], "seed": seed}
-        for life in BUNDLED_CELLS
-        for algo in chosen.algos
-        for seed in chosen.seeds
-    ]
-    runs += [{"algo": "lac", "lives": list(BUNDLED_CELLS), "seed": seed} for seed in chosen.seeds if chosen.export]
+    runs = [(algo, [life], seed, study.out) for life, algo, seed in product(BUNDLED_CELLS, chosen.algos, chosen.seeds)]
+    runs += [("lac", list(BUNDLED_CELLS), seed, study.out) for seed in chosen.seeds if chosen.export]
     study.configuration |= {"options": OPTIONS, "trained_with": TRAINED_WITH, "cells": TRAINING_CELLS, "updates": UPDATES}
-    study.run(training, runs, folder=study.out)
+    study.each(train, () if study.redraws else runs)
     asked: list[dict[str, Any]] = []
     for judged, life in CELLS.items():
         of_cell = {"judged": judged, "every": chosen.every}

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from textwrap import fill
+from timeit import Timer
 from typing import Any, Literal
 
 import numpy as np
@@ -37,7 +38,7 @@ from battery_env.policies.pretrained import pretrained_card
 from battery_env.sensors import RandomSensorErrors, SensorErrors
 from battery_env.tasks.data import Q_MOBILE_RANGE_C, R_O_RANGE_OHM, standard_dataset
 from battery_env.trajectories import TrajectoryDataset
-from benchmarks.contests import HELD_OUT, SENSORS
+from benchmarks.contests import HELD_OUT, SENSORS, rows_of_parameters
 from benchmarks.kalman_filter import PlainKalmanFilter
 from benchmarks.pretrained import OPTIONS
 from benchmarks.study import (
@@ -104,71 +105,41 @@ _STEP = slice(102, 104)
 
 @dataclass(frozen=True)
 class Calibrator:
-    """
-    A calibrator in a comparison.
-
-    :param name: as shown to readers
-    :param needs: what it has to know
-    :param make: makes it, from the names of what is unknown and the noise that it is told, V, if it is
-    :param full_state: whether it is shown the state without any sensor
-    :param slow: whether it is run on a few discharges only
-    :param policy: digest of the policy that it uses
-    """
+    """A calibrator in a comparison."""
 
     name: str
-    needs: str
-    make: Callable[[Sequence[str], float | None], Estimator]
-    full_state: bool = False
+    needs: str  # what it has to know, as shown to readers
+    make: Callable[[Sequence[str], float | None], Estimator]  # of what is unknown and the noise that it is told, V
+    full_state: bool = False  # whether it is shown the state without any sensor
     slow: bool = False
-    policy: str = ""
+    policy: str = ""  # its digest
 
 
 @dataclass(frozen=True)
 class Condition:
-    """
-    A condition.
+    """What sensors and cells are like in a part of a comparison."""
 
-    :param labels: what names it, as columns of tables
-    :param sensors: errors of the sensors
-    :param told_V: noise of the voltage that calibrators are told; None: not any
-    :param mismatch: relative standard deviation of the constants of the model
-    :param alone: whether one parameter is unknown at a time, and the other one held at the new cell's value
-    :param other_worn: whether the one that is held is a little worn
-    :param share: of the discharges
-    :param tried: calibrators that are run, all if none is named
-    """
-
-    labels: Mapping[str, str | float]
+    labels: Mapping[str, str | float]  # what names it, as columns of tables
     sensors: SensorErrors | RandomSensorErrors = field(default_factory=lambda: SensorErrors(noise_V=NOISE_V))
-    told_V: float | None = NOISE_V
-    mismatch: float = 0.0
-    alone: bool = False
-    other_worn: bool = False
-    share: float = 1.0
-    tried: tuple[str, ...] = ()
+    told_V: float | None = NOISE_V  # noise of the voltage that calibrators are told
+    mismatch: float = 0.0  # relative standard deviation of the constants of the model
+    alone: bool = False  # whether one parameter is unknown at a time, and the other one held at the new cell's value
+    other_worn: bool = False  # whether the one that is held is a little worn
+    share: float = 1.0  # of the discharges
+    tried: tuple[str, ...] = ()  # calibrators that are run, all if none is named
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """
-    A study: who is compared under which conditions.
+    """A study: who is compared under which conditions."""
 
-    :param about: what readers have to know
-    :param conditions: as above
-    :param calibrators: as above
-    :param discharges: how many, by default
-    :param work: the discharges of a condition, from what is unknown and their number
-    :param seed: of the noise
-    :param by_parameter: whether its raw table has a row for each parameter
-    """
-
-    about: str
+    about: str  # what readers have to know
     conditions: tuple[Condition, ...]
     calibrators: tuple[Calibrator, ...]
-    discharges: int
-    work: Callable[[Condition, Sequence[str], int], TrajectoryDataset]
-    seed: int = 1
-    by_parameter: bool = False
+    discharges: int  # by default
+    work: Callable[[Condition, Sequence[str], int], TrajectoryDataset]  # of what is unknown and a number of discharges
+    seed: int = 1  # of the noise
+    by_parameter: bool = False  # whether its raw table has a row for each parameter
 
 
 class FollowTheFit:
@@ -328,16 +299,9 @@ COMPARISONS = {
 def cpu_time_per_estimate_s(estimator: Estimator, data: TrajectoryDataset, slow: bool) -> float:
     """What an estimate costs on one core, on a few discharges; the least of several times, as others may use the machine."""
     records = [data[0].part(0, 200)] if slow else [data[n] for n in range(min(len(data), TIMED_DISCHARGES))]
-    spent_s, estimates = 0.0, 0
-    for record in records:
-        times_s = []
-        for _ in range(TIMED_REPETITIONS):
-            start_s = time.process_time()
-            trace = estimator.trace([record])[0]
-            times_s.append(time.process_time() - start_s)
-        spent_s += min(times_s)
-        estimates += len(trace.time_s)
-    return spent_s / estimates
+    estimates = sum(len(trace.time_s) for trace in estimator.trace(records))
+    timers = [Timer(partial(estimator.trace, [record]), timer=time.process_time) for record in records]
+    return sum(min(timer.repeat(TIMED_REPETITIONS, number=1)) for timer in timers) / estimates
 
 
 def part(comparison: str, calibrator: str, condition: int, unknown: Sequence[str], discharges: int, policy: str) -> Tables:
@@ -367,14 +331,8 @@ def parts(name: str, n: int) -> list[dict[str, Any]]:
 
 
 def by_parameter(scores: pd.DataFrame, labels: Iterable[str], unknown: Sequence[str] = PARAMETER_NAMES) -> pd.DataFrame:
-    """Scores as ``evaluate`` gives them, with a row for each parameter."""
-    tables = [
-        scores.rename(columns=lambda column, name=name: column.removeprefix(f"{name}_")).assign(
-            parameter=name, true=scores[name]
-        )
-        for name in unknown
-    ]
-    return pd.concat(tables, ignore_index=True)[["calibrator", *labels, "parameter", *_MEASURES]]
+    """What is published of scores, with a row for each parameter."""
+    return rows_of_parameters(scores, unknown)[["calibrator", *labels, "parameter", *_MEASURES]]
 
 
 def summary(results: pd.DataFrame, labels: Sequence[str], needs: Mapping[str, str]) -> pd.DataFrame:
@@ -417,10 +375,8 @@ an unbiased calibrator can have. Times are CPU times on one core.
 
 
 def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
-    """
-    The mean error and that of the middle 90 % of the discharges, from a table with a row for each parameter: a row for each
-    condition, in it the calibrators one below the other. Variants of a calibrator have its colour and a marker of their own.
-    """
+    """The mean error and that of the middle 90 % of the discharges: a row for each condition, in it all calibrators."""
+    # variants of a calibrator have its colour and a marker of their own
     styles = {
         name: (colour, marker)
         for marker, (colour, name) in zip(

@@ -29,7 +29,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import coloured
 from benchmarks import roots
-from benchmarks.control import DISTURBANCES, IMPULSE_INTERVAL, conditions, roll_out
+from benchmarks.control import DISTURBANCES, IMPULSE_INTERVAL, conditions, one_at_a_time, roll_out
 from benchmarks.runs import Run, make_rows, rows_command_line, setting_of_lac
 from benchmarks.study import Study, add_legend, digits, markdown, natural, new_panels, table_of, with_interval
 from sb3_lac.stability.plots import format_log_axis
@@ -68,13 +68,7 @@ def outside(env_id: str) -> dict[str, dict[str, Any]]:
     """Disturbances beyond the ranges, one at a time."""
     impulse, _, process_noise, observation_noise, delay = DISTURBANCES[env_id]
     name, _, value = PARAMETERS[env_id]
-    return {
-        "impulses": {"impulse": BEYOND * impulse, "impulse_interval": IMPULSE_INTERVAL},
-        "other parameters": {"changed_parameters": {name: value}},
-        "process noise": {"process_noise": BEYOND * process_noise},
-        "observation noise": {"observation_noise": BEYOND * observation_noise},
-        "action delay": {"action_delay": delay + 1},
-    }
+    return one_at_a_time(BEYOND * impulse, {name: value}, BEYOND * process_noise, BEYOND * observation_noise, delay + 1)
 
 
 def run_of(env_id: str, algorithm: str, seed: int, last_actions: int = 0, timesteps: int | None = None) -> Run:

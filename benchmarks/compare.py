@@ -96,7 +96,6 @@ def finished_runs(study: Study) -> pd.DataFrame:
     for arguments, tables in study.done(part):
         run = Run(**arguments["run"])
         record = made_by(run, _folder(run, study.out))
-        summary = contest_of(run.task).summary(tables["scores"])
         rows.append(
             {
                 "env": registered_id(run.task),
@@ -107,9 +106,7 @@ def finished_runs(study: Study) -> pd.DataFrame:
                 # an algorithm with roll-outs of fixed length makes more than it is asked for
                 "timesteps": record["timesteps"],
                 "label": run.algorithm,
-                "scores": summary.get("scores"),
                 **{name: record[name] for name in ("updates", "resumed", "training_minutes")},
-                "time_per_update_us": summary["time_per_update_us"],
                 "made_by": record,
                 "tables": tables,
             }

@@ -79,23 +79,23 @@ def held_out_trajectories(env_id: str) -> TrajectoryDataset:
     return data
 
 
+def rows_of_parameters(scores: pd.DataFrame, parameters: Sequence[str]) -> pd.DataFrame:
+    """Scores as ``evaluate`` gives them, with a row for each parameter."""
+    tables = []
+    for name in parameters:
+        of_name = scores.rename(columns=lambda column, name=name: column.removeprefix(f"{name}_"))
+        tables.append(of_name.assign(parameter=name, true=scores[name]))
+    return pd.concat(tables)
+
+
 class Contest(ABC):
-    """
-    Scores by which algorithms are compared in one kind of environment.
+    """Scores by which algorithms are compared in one kind of environment."""
 
-    :param env_id: id of the environment
-    :ivar env_id: the same, without the module that registers it
-    :ivar options: of the environment while evaluating
-    :ivar metrics: which columns of the scores are followed while training, and the name of each; smaller is better
-    :ivar stems: for each of these names, how the names of files of learning curves begin
-    """
-
-    #: The metric that is followed, in files of learning curves and in figures.
-    metric: str
+    metric: str  # that is followed while training, in files of learning curves and in figures; smaller is better
     label: str
-    options: Mapping[str, Any]
-    metrics: Mapping[str, str]
-    stems: Mapping[str, str]
+    options: Mapping[str, Any]  # of the environment while evaluating
+    metrics: Mapping[str, str]  # columns of the scores that are followed, and the name of each
+    stems: Mapping[str, str]  # for each of these names, how the names of files of learning curves begin
 
     def __init__(self, env_id: str) -> None:
         self.env_id = registered_id(env_id)
@@ -103,10 +103,6 @@ class Contest(ABC):
     @abstractmethod
     def scores(self, model: BaseAlgorithm, env: VecEnv, brief: bool = False) -> pd.DataFrame:
         """Score a policy."""
-
-    def summary(self, scores: pd.DataFrame) -> dict[str, Any]:
-        """Summarise the scores of a run."""
-        return {"time_per_update_us": 1e6 * float(scores["time_per_update_s"].iloc[0])}
 
     @abstractmethod
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -128,11 +124,7 @@ class Contest(ABC):
 
 
 class Calibration(Contest):
-    """
-    Calibrators on held-out discharges.
-
-    :param env_id: id of a calibration environment
-    """
+    """Calibrators on held-out discharges."""
 
     metric = "mape_percent"
     label = "MAPE (%)"
@@ -162,27 +154,23 @@ class FullState(Calibration):
         errors = [f"{name}_{self.metric}" for name in self.parameters]
         return scores.join(start_off[errors].add_prefix("start_off_"))
 
-    def summary(self, scores: pd.DataFrame) -> dict[str, Any]:
-        of_parameters = {}
-        for name in self.parameters:
-            start_off = scores[f"start_off_{name}_{self.metric}"]
-            of_parameters[name] = {
-                **summarize(scores, name),
-                "start_off_mape_percent": float(start_off.mean()),
-                "start_off_worst_percent": float(start_off.max()),
-            }
-        return {**super().summary(scores), "scores": of_parameters}
-
     def table(self, runs: pd.DataFrame) -> pd.DataFrame:
         """The scores of all runs, and of the closed form."""
-        exact = evaluate(ClosedForm(), self.test)
+
+        def scored(of: pd.DataFrame, scores: Sequence[pd.DataFrame], name: str) -> pd.DataFrame:
+            times_us = [1e6 * float(each["time_per_update_s"].iloc[0]) for each in scores]
+            summaries = pd.DataFrame([summarize(each, name) for each in scores], index=of.index)
+            return of.assign(time_per_update_us=times_us, parameter=name).join(summaries)
+
+        exact, of_runs = evaluate(ClosedForm(), self.test), [tables["scores"] for tables in runs["tables"]]
+        closed_form = pd.DataFrame([{"env": self.env_id, "algo": "closed form", "label": "closed form"}])
         tables = []
         for name in self.parameters:
-            of_name = pd.DataFrame([scores[name] for scores in runs["scores"]], index=runs.index)
-            tables.append(runs.drop(columns="scores").assign(parameter=name).join(of_name))
-            row: dict[str, Any] = {"env": self.env_id, "parameter": name, "algo": "closed form", "label": "closed form"}
-            row |= summarize(exact, name)
-            tables.append(pd.DataFrame([{**row, "time_per_update_us": 1e6 * float(exact["time_per_update_s"].iloc[0])}]))
+            start_off = [scores[f"start_off_{name}_{self.metric}"] for scores in of_runs]
+            table = scored(runs, of_runs, name)
+            table["start_off_mape_percent"] = [errors.mean() for errors in start_off]
+            table["start_off_worst_percent"] = [errors.max() for errors in start_off]
+            tables += [table, scored(closed_form, [exact], name)]
         return pd.concat(tables, ignore_index=True)
 
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -309,9 +297,6 @@ class Episodes(Contest):
         returns, lengths = evaluate_policy(model, env, episodes, return_episode_rewards=True)
         return pd.DataFrame({"cost": -np.asarray(returns), "length": lengths})
 
-    def summary(self, scores: pd.DataFrame) -> dict[str, Any]:
-        return {"time_per_update_us": None}
-
     def report(self, runs: pd.DataFrame, study: Study) -> tuple[pd.DataFrame, pd.DataFrame]:
         self.write_learning(runs, study)
         scores = [run["scores"] for run in runs["tables"]]
@@ -320,9 +305,7 @@ class Episodes(Contest):
             cost_worst=[of_run["cost"].max() for of_run in scores],
             length=[of_run["length"].mean() for of_run in scores],
         )
-        study.write_table(
-            self.env_id, table.drop(columns=["scores", "label", *OF_RUN, "time_per_update_us"]), recipes_of(runs)
-        )
+        study.write_table(self.env_id, table.drop(columns=["label", *OF_RUN]), recipes_of(runs))
         cells: dict[str, Cell] = {
             **_RECIPE,
             "cost of an episode": ("cost", with_spread),

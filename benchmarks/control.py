@@ -53,10 +53,15 @@ _FIT_SEED, _JUDGE_SEED, _CERTIFICATION_SEED = 10_000, 20_000, 30_000
 
 
 def conditions(env_id: str) -> dict[str, dict[str, Any]]:
-    """The disturbances that a controller is tried with, one at a time."""
-    impulse, changed, process_noise, observation_noise, delay = DISTURBANCES[env_id]
+    """The disturbances that a controller is tried with, one at a time, and none."""
+    return {"none": {}, **one_at_a_time(*DISTURBANCES[env_id])}
+
+
+def one_at_a_time(
+    impulse: float, changed: dict[str, float], process_noise: float, observation_noise: float, delay: int
+) -> dict[str, dict[str, Any]]:
+    """Arguments of an environment for each of its disturbances by itself."""
     return {
-        "none": {},
         "impulses": {"impulse": impulse, "impulse_interval": IMPULSE_INTERVAL},
         "other parameters": {"changed_parameters": changed},
         "process noise": {"process_noise": process_noise},
@@ -71,10 +76,7 @@ def roll_out(
     episodes: int,
     seed: int = EVALUATION_SEED,
 ) -> pd.DataFrame:
-    """
-    Run the mean action of a policy in all episodes at once, and return one row per episode. A cost is minus a reward; errors
-    are those that a cost environment tells.
-    """
+    """Run the mean action of a policy in all episodes at once, one row each; a cost is minus the mean reward of a step."""
     envs = [make_env() for _ in range(episodes)]
     starts = [env.reset(seed=seed + episode) for episode, env in enumerate(envs)]
     observations = np.array([observation for observation, _ in starts])
@@ -123,12 +125,17 @@ def summary(outcome: pd.DataFrame, tolerance: float) -> dict[str, float]:
 
 
 def tried_with(
-    policy: PolicyPredictor, env_id: str, episodes: int, arguments: Mapping[str, Any], make: Callable[..., Any] = gym.make
+    policy: PolicyPredictor,
+    env_id: str,
+    episodes: int,
+    arguments: Mapping[str, Any],
+    make: Callable[..., Any] = gym.make,
+    seed: int = EVALUATION_SEED,
 ) -> dict[str, float]:
     """Try a policy in an environment that is made with some arguments."""
     problem = gym.make(env_id).unwrapped
     assert isinstance(problem, CostEnv)
-    return summary(roll_out(policy, partial(make, env_id, **arguments), episodes), problem.error_tolerance)
+    return summary(roll_out(policy, partial(make, env_id, **arguments), episodes, seed), problem.error_tolerance)
 
 
 def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
@@ -142,12 +149,7 @@ def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:
 
 
 class ScaledController:
-    """
-    A controller whose actions are multiplied by a factor.
-
-    :param controller: the controller
-    :param factor: -1 .. 1
-    """
+    """A controller whose actions are multiplied by a factor of -1 .. 1."""
 
     def __init__(self, controller: PolicyPredictor, factor: float) -> None:
         self.controller, self.factor = controller, factor

@@ -15,10 +15,8 @@ import argparse
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import pandas as pd
 
@@ -38,15 +36,8 @@ UPDATES = 1000  # published results have 6000
 EVALUATIONS, EVERY, EVERY_IN_THE_END = 5, 40, 8
 
 
-class Learned(NamedTuple):
-    """Errors of one algorithm: while it learned, and on each discharge in the end."""
-
-    curve: pd.DataFrame
-    scores: pd.DataFrame
-
-
-def learned(algo: str) -> Learned:
-    """Train one policy by its entry in zoo_configs."""
+def learned(algo: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Train one policy by its entry in zoo_configs: its errors while it learned, and on each discharge in the end."""
     _, test = TrajectoryDataset.paper(PARAMETER).split(test=0.3, seed=0)
     run = zoo_run(algo, ENV, 0, updates=UPDATES)
     callback = CalibrationCallback(
@@ -57,32 +48,20 @@ def learned(algo: str) -> Learned:
     )
     with tempfile.TemporaryDirectory() as folder:
         model = train_or_load(run, Path(folder), callbacks=[callback])
-    scores = evaluate(PolicyEstimator(model, ENV), test[::EVERY_IN_THE_END])
-    return Learned(pd.DataFrame(callback.history), scores)
+    return pd.DataFrame(callback.history), evaluate(PolicyEstimator(model, ENV), test[::EVERY_IN_THE_END])
 
 
 def compared(out: Path) -> str:
     """Train the algorithms side by side, draw what they reached, and say it."""
     with workers(len(ALGORITHMS)) as executor:
         results = dict(zip(map(str.upper, ALGORITHMS), executor.map(importable(learned), ALGORITHMS), strict=True))
-    scores = {algo: each.scores for algo, each in results.items()}
+    curves = {algo: [curve] for algo, (curve, _) in results.items()}
+    scores = {algo: of_discharges for algo, (_, of_discharges) in results.items()}
     save_figure(plot_true_against_inferred(scores, PARAMETER), out / f"{ENV}_inferred.png")
-    save_figure(plot_learning_curves({algo: [each.curve] for algo, each in results.items()}, ENV), out / f"{ENV}_learning.png")
+    save_figure(plot_learning_curves(curves, ENV), out / f"{ENV}_learning.png")
     errors = {algo: each[f"{PARAMETER}_mape_percent"] for algo, each in scores.items()}
     summary = ", ".join(f"{algo} {error.mean():.2g} % ({error.max():.2g} %)" for algo, error in errors.items())
     return f"R_o of held-out simulated cells, mean error (worst discharge): {summary}"
-
-
-@contextmanager
-def followed(out: Path) -> Iterator[None]:
-    """Calibrate to all discharges of a real cell meanwhile, in a process of its own."""
-    command = [sys.executable, "-m", "battery_env", CELL, "--table-only", "--force", "--out", str(out)]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        try:
-            yield
-        except BaseException:
-            process.terminate()
-            raise
 
 
 def aged(out: Path) -> str:
@@ -102,8 +81,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"1/2  LAC, SAC and TD3 learn to find R_o of simulated cells, {UPDATES} updates each")
     print("     (with the full state, as here, a closed form is exact: this compares algorithms)")
     print(f"2/2  battery-calibrate {CELL} --out {life}: all discharges of a real cell\n", flush=True)
-    with followed(life):
-        errors = compared(trained)
+    # meanwhile, in a process of its own
+    command = [sys.executable, "-m", "battery_env", CELL, "--table-only", "--force", "--out", str(life)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        try:
+            errors = compared(trained)
+        except BaseException:
+            process.terminate()
+            raise
     print(f"Found:    {errors}; {aged(life)}")
     print(f"Pictures: {trained / f'{ENV}_inferred.png'}, {trained / f'{ENV}_learning.png'}, {life / 'life.png'}")
     print(

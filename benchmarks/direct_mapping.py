@@ -24,6 +24,7 @@ import numpy as np
 import pandas as pd
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 
 from battery_env.arrays import FloatArray
@@ -36,6 +37,7 @@ from battery_env.parameters import PARAMETER_NAMES
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.tasks.full_state.layout import LITERAL, OBSERVED
 from battery_env.trajectories import TrajectoryDataset
+from benchmarks.contests import rows_of_parameters
 from benchmarks.runs import train_or_load
 from benchmarks.study import (
     SYMBOLS,
@@ -67,7 +69,7 @@ MAPPINGS = {"raw": "direct mapping, raw (the paper's)", "normalised": "direct ma
 ENV_IDS: dict[str, str] = {"q_mobile": "BatteryQmax-v0", "r_o": "BatteryRo-v0"}
 
 # The paper's network and optimizer; it does not name the size of a batch
-_LAYERS = (256, 256, 256)
+_LAYERS = [256, 256, 256]
 _LEARNING_RATE = 5e-4
 _BATCH_SIZE = 64
 # Pairs that go through the network at once when it is used
@@ -111,19 +113,12 @@ def training_file(parameter: Parameter, out: Path) -> Path:
 
 
 class Pairs(NamedTuple):
-    """
-    Labelled pairs.
+    """Labelled pairs of consecutive states without the temperature."""
 
-    :param before: x_t, states without the temperature, shape (n, 7)
-    :param after: x_{t+1}, shape (n, 7)
-    :param load_W: u_{t+1}, the power over that second, shape (n,)
-    :param label: the true parameter, C or ohm, shape (n,)
-    """
-
-    before: FloatArray
-    after: FloatArray
-    load_W: FloatArray
-    label: FloatArray
+    before: FloatArray  # x_t, shape (n, 7)
+    after: FloatArray  # x_{t+1}, shape (n, 7)
+    load_W: FloatArray  # u_{t+1}, the power over that second, shape (n,)
+    label: FloatArray  # the true parameter, C or ohm, shape (n,)
 
 
 def draw_pairs(data: TrajectoryDataset, parameter: Parameter, n: int, seed: int) -> Pairs:
@@ -155,28 +150,14 @@ class _Scale:
 
 
 class DirectMapping(Estimator):
-    """
-    The paper's rival: a network that is taught, with labels, to tell the parameter from two consecutive states and the load
-    between them. It has the policy's layers, activations, optimizer and learning rate, and no memory.
-
-    :param normalised: whether inputs and labels are shifted and scaled to mean 0 and standard deviation 1
-    :param parameter: what it tells; the other one is known
-    :param pairs: to learn from
-    :param epochs: how often each pair is shown
-    :param seed: of first weights and order
-    """
+    """The paper's rival: the policy's network, taught with labels to tell a parameter from two consecutive states."""
 
     def __init__(self, normalised: bool, parameter: Parameter, pairs: Pairs, epochs: int, seed: int) -> None:
         self.parameter = parameter
         inputs, labels = _inputs(pairs), pairs.label[:, None]
         self._inputs, self._labels = (_Scale(values, normalised) for values in (inputs, labels))
         th.manual_seed(seed)
-        layers: list[nn.Module] = []
-        width = inputs.shape[1]
-        for size in _LAYERS:
-            layers += [nn.Linear(width, size), nn.LeakyReLU()]
-            width = size
-        self.network = nn.Sequential(*layers, nn.Linear(width, 1))
+        self.network = nn.Sequential(*create_mlp(inputs.shape[1], 1, _LAYERS, nn.LeakyReLU))
         self._fit(self._inputs.to_tensor(inputs), self._labels.to_tensor(labels), epochs)
 
     def _fit(self, inputs: th.Tensor, labels: th.Tensor, epochs: int) -> None:
@@ -223,21 +204,11 @@ def scores(estimator: Estimator, parameter: Parameter, division: str, method: st
     """Score a calibrator on the test part of a division."""
     test = divided(parameter, division)[1]
     scores_of_test = evaluate(estimator, test.subset(range(0, len(test), max(len(test) // TEST_DISCHARGES, 1))))
-    columns = {
-        "load_W": "load",
-        "true": parameter,
-        "inferred": f"{parameter}_hat",
-        "mape_percent": f"{parameter}_mape_percent",
-        "final_error_percent": f"{parameter}_final_error_percent",
-        "worst": f"{parameter}_worst",
-        "bias": f"{parameter}_bias",
-        "spread": f"{parameter}_spread",
-        "time_per_estimate_s": "time_per_update_s",
-    }
-    table = pd.DataFrame({name: scores_of_test[column] for name, column in columns.items()})
-    for name, value in (("seed", seed), ("division", division), ("parameter", parameter), ("method", method)):
-        table.insert(0, name, value)
-    return {"direct_mapping": table}
+    shown = {"load": "load_W", "hat": "inferred", "time_per_update_s": "time_per_estimate_s"}
+    rows = rows_of_parameters(scores_of_test, [parameter]).rename(columns=shown)
+    columns = ["method", "parameter", "division", "seed", "load_W", "true", "inferred", "mape_percent", "final_error_percent"]
+    columns += ["worst", "bias", "spread", "time_per_estimate_s"]
+    return {"direct_mapping": rows.assign(method=method, division=division, seed=seed)[columns]}
 
 
 def mapping_part(kind: str, parameter: Parameter, division: str, seed: int, pairs: int, epochs: int) -> Tables:

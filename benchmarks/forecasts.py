@@ -151,11 +151,9 @@ def real_rows(cell: str, discharges: list[Discharge], life: Life, every: int) ->
     rows: list[dict[str, object]] = []
     for n in tqdm(range(1, len(discharges), every), desc=cell, unit="discharge", file=sys.stderr):
         running, last = discharges[n], discharges[n - 1].loaded_part(CUT_OFF_V)
-        current_A = float(running.loaded_part(CUT_OFF_V).current_A[-1])
-        knows, end_s = {FORECAST: (NEW, life.after(n)), OF_SIZE: (NOMINAL, None), NO_LIFE: (NEW, None)}, running.eod_time_s(
-            CUT_OFF_V
-        )
-        said = ends(last, running, knows, partial(_held, constant(current_A, "current")), end_s)
+        load = constant(float(running.loaded_part(CUT_OFF_V).current_A[-1]), "current")
+        knows: dict[str, Known] = {FORECAST: (NEW, life.after(n)), OF_SIZE: (NOMINAL, None), NO_LIFE: (NEW, None)}
+        said = ends(last, running, knows, partial(_held, load), running.eod_time_s(CUT_OFF_V))
         rows += [{"data": cell, "load": "2 A", "discharge": n + 1} | row for row in said]
     return rows
 

@@ -47,16 +47,8 @@ _NO_VERDICT = (Finding("other", measured={"message": "This filter has no verdict
 
 class PlainKalmanFilter(OnlineEstimator):
     """
-    Follows ``q_mobile``, ``r_o`` and an offset of the voltage along a discharge of a cell that was full and at rest. The state
+    Follows ``q_mobile``, ``r_o`` and an offset of the voltage along a discharge of a cell that was full and at rest; the state
     is a function of these, and moves along with them by its tangents.
-
-    :param parameters: which to search for; the other one is the cell's
-    :param cell: constants of the model; ``None``: the new cell's
-    :param thermal: whether the temperature of the model moves
-    :param dt_s: longest time step of the model, s
-    :param voltage_noise_V: standard deviation of what the voltage says beyond the model, V
-    :param prior_q_mobile_C: mean and standard deviation before the discharge, C; ``None``: a quarter, about the cell's
-    :param prior_r_o_ohm: likewise, ohm; ``None``: 0.15 ohm, about the cell's
     """
 
     def __init__(

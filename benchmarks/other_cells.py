@@ -31,7 +31,7 @@ from battery_env.plotting import COLOURS
 from battery_env.records import VARIED_SHARE, mean_current_A
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION
 from benchmarks.forecasts import as_long_as_the_last, coulomb_count
-from benchmarks.pybamm_cells import BEFORE, SHARES, end_in_percent, over_shares
+from benchmarks.pybamm_cells import BEFORE, SHARES, draw_ends, end_in_percent, over_shares
 from benchmarks.study import Cell, Study, Tables, command_line, markdown, new_panels, table_of
 
 DATA = Path(__file__).parent / "data"
@@ -137,12 +137,8 @@ def plot(rows: pd.DataFrame) -> Figure:
     half = rows[rows["share"] == 0.5]
     figure, panels = new_panels(half["cell"].nunique(), 3, (3.4, 3.0))
     for axes, (cell, group) in zip(panels, half.groupby("cell", sort=False), strict=True):
-        error = group["error_percent"]
-        beside = [error - group["low_percent"], group["high_percent"] - error]
-        axes.errorbar(group["discharge"], error, beside, fmt=".", color=COLOURS[0], lw=0.8, label="forecast, 90 %")
+        draw_ends(axes, [(COLOURS[0], ("forecast, 90 %", group))], CELLS[str(cell)].title)
         axes.plot(group["discharge"], group["count_error_percent"], "x", ms=4, color=COLOURS[1], label="last charge, counted")
-        axes.axhline(0.0, color="black", lw=0.6)
-        axes.set(title=CELLS[str(cell)].title, xlabel="discharge", ylabel="error of the end, half seen (%)")
         # a cell of a single discharge has one tick, too
         axes.set_xlim(group["discharge"].min() - 0.5, group["discharge"].max() + 0.5)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))

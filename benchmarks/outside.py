@@ -33,7 +33,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from battery_env.plotting import coloured, draw_over_seeds
 from benchmarks.control import roll_out
-from benchmarks.runs import AT_THE_END, POINTS, Run, make_rows, rows_command_line, setting_of_lac
+from benchmarks.runs import AT_THE_END, CURVE, Run, make_rows, rows_command_line, setting_of_lac
 from benchmarks.study import Study, add_legend, digits, markdown, new_panels, with_interval
 
 #: Environment steps of each task, the cheap ones first; the last one takes an hour and is trained only where it is named.
@@ -98,7 +98,6 @@ TUNED: dict[str, dict[str, dict[str, Any]]] = {
     "MountainCarContinuous-v0": {"lac_zoo": _CAR_OF_LAC, "sac": _CAR, "tqc": _CAR},
 }
 EPISODES = 20
-_CURVE = {100 * point // POINTS: f"after_{100 * point // POINTS}_percent" for point in range(1, POINTS + 1)}
 
 
 def run_of(task: str, algorithm: str, seed: int, timesteps: int | None = None) -> Run:
@@ -120,10 +119,8 @@ def difference(scores: np.ndarray, rival_scores: np.ndarray, axis: int = -1) -> 
 
 def improvement(*scores: np.ndarray, axis: int = -1) -> np.ndarray:
     """
-    The probability that one of our scores is above one of the others', mean over tasks, where equal ones are half above
-    (Agarwal et al. 2021).
-
-    :param scores: ours and the others' of a task, then of the next
+    The probability that one of our scores is above one of the others' (Agarwal et al. 2021), mean over tasks, of ours and the
+    others' scores of each task in turn.
     """
     of_tasks = []
     for own_scores, rival_scores in zip(scores[::2], scores[1::2], strict=True):
@@ -200,8 +197,8 @@ def plot_learning(rows: pd.DataFrame) -> Figure:
         for colour, (label, name) in coloured((label, name) for name, (label, *_) in ALGORITHMS.items()):
             own = task_rows[task_rows["algorithm"] == name]
             if len(own):
-                steps = np.array(list(_CURVE)) / 100 * own["timesteps"].iloc[0]
-                draw_over_seeds(axes, steps, own[list(_CURVE.values())], colour, label)
+                steps = np.array(list(CURVE)) / 100 * own["timesteps"].iloc[0]
+                draw_over_seeds(axes, steps, own[list(CURVE.values())], colour, label)
         axes.set_title(task, fontsize=10)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(alpha=0.25)

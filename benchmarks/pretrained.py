@@ -23,10 +23,11 @@ import pandas as pd
 
 from battery_env.evaluation import evaluate
 from battery_env.files import replacing
+from battery_env.parameters import PARAMETER_NAMES
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.policies.pretrained import file_stem, policy_of_file, write_card
 from battery_env.tasks.data import standard_dataset
-from benchmarks.contests import HELD_OUT, SENSORS
+from benchmarks.contests import HELD_OUT, SENSORS, rows_of_parameters
 from benchmarks.runs import Run, made_by, train_or_load
 from benchmarks.study import (
     SYMBOLS,
@@ -38,14 +39,13 @@ from benchmarks.study import (
     markdown,
     natural,
     positive,
-    row_by_row,
+    table_of,
     versions,
 )
 from benchmarks.zoo_runs import zoo_run
 from sb3_lac.onnx import export_onnx
 
-#: What each policy finds.
-FOUND: dict[str, tuple[str, ...]] = {"BatteryVoltageJoint-v0": ("q_mobile", "r_o")}
+ENV_IDS = ["BatteryVoltageJoint-v0"]
 #: How far kn, tDiffusion, to and tsn of the cells are from the model's, in training and as the observation takes them to be.
 MISMATCH = 0.2
 #: Options of the task that a policy needs when it is used.
@@ -70,32 +70,24 @@ def make(env_id: str, seed: int, updates: int, folder: Path) -> Run:
 def part(env_id: str, recipe: str, mismatch: float, sensor: str, discharges: int, folder: Path) -> Tables:
     """Score a policy."""
     policy, options = policy_of_file(folder / f"{file_stem(env_id, recorded=False)}.onnx")
-    data = standard_dataset(FOUND[env_id], "piecewise", "test", mismatch=mismatch)[:discharges]
+    data = standard_dataset(PARAMETER_NAMES, "piecewise", "test", mismatch=mismatch)[:discharges]
     scores = evaluate(PolicyEstimator(policy, env_id, **options), data, SENSORS[sensor], seed=1)
     return {"pretrained": scores.assign(env_id=env_id, recipe=recipe, mismatch=mismatch, sensor=sensor)}
 
 
 def summary(scores: pd.DataFrame) -> pd.DataFrame:
     """The scores over discharges."""
-    rows = []
-    for (env_id, mismatch, sensor), group in scores.groupby(["env_id", "mismatch", "sensor"], sort=False):
-        for name in FOUND[str(env_id)]:
-            error = group[f"{name}_second_half_mape_percent"]
-            rows.append(
-                {
-                    "env_id": env_id,
-                    "mismatch": mismatch,
-                    "sensor": sensor,
-                    "parameter": name,
-                    "discharges": len(group),
-                    "mean_percent": error.mean(),
-                    "sd_percent": error.std(),
-                    "worst_percent": error.max(),
-                    "final_percent": group[f"{name}_final_error_percent"].mean(),
-                    "time_per_estimate_ms": 1e3 * group["time_per_update_s"].iloc[0],
-                }
-            )
-    return pd.DataFrame(rows)
+    cells: dict[str, Cell] = {
+        "discharges": len,
+        "mean_percent": ("second_half_mape_percent", pd.Series.mean),
+        "sd_percent": ("second_half_mape_percent", pd.Series.std),
+        "worst_percent": ("second_half_mape_percent", pd.Series.max),
+        "final_percent": ("final_error_percent", pd.Series.mean),
+        "time_per_estimate_ms": ("time_per_update_s", lambda times_s: 1e3 * times_s.iloc[0]),
+    }
+    # both parameters of a discharge one after the other
+    rows = rows_of_parameters(scores, PARAMETER_NAMES).sort_index(kind="stable")
+    return table_of(rows, ["env_id", "mismatch", "sensor", "parameter"], cells)
 
 
 def card_of(run: Run, scores: pd.DataFrame, command: str, minutes: float) -> dict[str, Any]:
@@ -118,21 +110,22 @@ def card_of(run: Run, scores: pd.DataFrame, command: str, minutes: float) -> dic
 
 def summary_text(table: pd.DataFrame) -> str:
     """The summary for readers."""
-    cells: dict[str, Cell] = {
-        "environment": "{env_id}",
-        "constants off by": "{mismatch:g}",
-        "sensor": "{sensor}",
-        "parameter": ("parameter", SYMBOLS.__getitem__),
-        "mean ± sd (worst) error, second half (%)": "{mean_percent:.2f} ± {sd_percent:.2f} ({worst_percent:.1f})",
-        "last estimate (%)": "{final_percent:.2f}",
+    errors = zip(table["mean_percent"], table["sd_percent"], table["worst_percent"], strict=True)
+    columns = {
+        "environment": table["env_id"],
+        "constants off by": table["mismatch"].map("{:g}".format),
+        "sensor": table["sensor"],
+        "parameter": table["parameter"].map(SYMBOLS),
+        "mean ± sd (worst) error, second half (%)": [f"{mean:.2f} ± {sd:.2f} ({worst:.1f})" for mean, sd, worst in errors],
+        "last estimate (%)": table["final_percent"].map("{:.2f}".format),
     }
-    return markdown(row_by_row(table, cells))
+    return markdown(pd.DataFrame(columns))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("pretrained", __doc__, jobs=1)
-    parser.add_argument("--envs", nargs="+", choices=FOUND, default=list(FOUND), metavar="ID")
+    parser.add_argument("--envs", nargs="+", choices=ENV_IDS, default=ENV_IDS, metavar="ID")
     parser.add_argument("--seed", type=natural, default=0)
     parser.add_argument("--updates", type=positive, default=5000, help="gradient steps")
     parser.add_argument("--discharges", type=at_most(HELD_OUT), default=60, help="test discharges of the evaluation")

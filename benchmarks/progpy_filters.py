@@ -59,15 +59,7 @@ class BatteryWithUnknown(BatteryElectroChemEOD):
 
 
 class ProgpyFilter(Estimator):
-    """
-    One of progpy's state estimators on the voltage of a discharge that starts with a full cell at rest.
-
-    :param parameter: what is unknown: ``"q_mobile"`` or ``"r_o"``; the other one is the new cell's
-    :param kind: ``"ukf"`` (alpha 0.3, beta 2, kappa 0) or ``"particles"`` (100 of them, progpy's default)
-    :param prior_sd: standard deviation of the parameter at the start, about the new cell's value, C or ohm
-    :param voltage_noise_V: of the sensor, V
-    :param seed: seed of the particles
-    """
+    """One of progpy's state estimators on the voltage of a discharge of a full cell, new but for one parameter (C or ohm)."""
 
     def __init__(
         self, parameter: str, kind: Literal["ukf", "particles"], prior_sd: float, voltage_noise_V: float, seed: int = 0

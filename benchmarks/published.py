@@ -113,13 +113,7 @@ class EndFarAway(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
 
 
 class OtherReferenceEnv(OscillatorEnv):
-    """
-    The oscillator with a reference that nobody was trained with.
-
-    :param mean: of the reference
-    :param amplitude: of its sine
-    :param period_steps: of its sine
-    """
+    """The oscillator with a reference that nobody was trained with."""
 
     def __init__(self, mean: float, amplitude: float, period_steps: int) -> None:
         super().__init__()

@@ -17,11 +17,12 @@ life was found on these cells; no number was chosen on them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from battery_env import Discharge, Settings, calibrate, fit_cell, track_life
@@ -172,9 +173,9 @@ def end_in_percent(quantiles_s: FloatArray, start_s: float, end_s: float) -> dic
     return {"error_percent": middle, "low_percent": low, "high_percent": high, "inside": float(low <= 0.0 <= high)}
 
 
-def over_shares(column: str, how: str) -> Cell:
-    """What a cell of a table says of a column at each share of the time."""
-    return lambda group: side_by_side(group.groupby("share")[column].agg(how).dropna())
+def over_shares(column: str, how: str, by: str = "share") -> Cell:
+    """What a cell of a table says of a column at each share of the time, or at each value of another column."""
+    return lambda group: side_by_side(group.groupby(by)[column].agg(how).dropna())
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
@@ -195,17 +196,23 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
 
 def surroundings_table(rows: pd.DataFrame) -> pd.DataFrame:
     """One line a cell: whole discharges in other surroundings, with constants that were fitted in those of the life."""
-
-    def by_surroundings(column: str) -> Cell:
-        return lambda group: side_by_side(group.groupby("surroundings_C")[column].mean())
-
     cells: dict[str, Cell] = {
-        f"q_mobile at {side_by_side(OTHERS_C)} degC: off (%)": by_surroundings("q_mobile_percent"),
-        "in standard deviations": by_surroundings("q_mobile_sd"),
-        "r_o over that of the life": by_surroundings("r_o_ratio"),
+        f"q_mobile at {side_by_side(OTHERS_C)} degC: off (%)": over_shares("q_mobile_percent", "mean", "surroundings_C"),
+        "in standard deviations": over_shares("q_mobile_sd", "mean", "surroundings_C"),
+        "r_o over that of the life": over_shares("r_o_ratio", "mean", "surroundings_C"),
         "settled q_mobile (%)": ("settled_q_mobile", share_in_percent),
     }
     return table_of(rows.assign(cell=rows["cell"].map(CELLS)), ["cell"], cells)
+
+
+def draw_ends(axes: Axes, forecasts: Iterable[tuple[str, tuple[Any, pd.DataFrame]]], title: str) -> None:
+    """The errors of ends and their intervals, half seen, over the discharges of a cell: by colour and name."""
+    for colour, (name, rows) in forecasts:
+        error = rows["error_percent"]
+        beside = [error - rows["low_percent"], rows["high_percent"] - error]
+        axes.errorbar(rows["discharge"], error, beside, fmt=".", color=colour, lw=0.8, label=name)
+    axes.axhline(0.0, color="black", lw=0.6)
+    axes.set(title=title, xlabel="discharge", ylabel="error of the end, half seen (%)")
 
 
 def plot(rows: pd.DataFrame) -> Figure:
@@ -213,12 +220,7 @@ def plot(rows: pd.DataFrame) -> Figure:
     half = rows[rows["share"] == 0.5]
     figure, panels = new_panels(len(CELLS), 3, (3.4, 3.0))
     for axes, (cell, of_cell) in zip(panels, half.groupby("cell", sort=False), strict=False):
-        for colour, (knows, group) in coloured(of_cell.groupby("knows", sort=False)):
-            error = group["error_percent"]
-            beside = [error - group["low_percent"], group["high_percent"] - error]
-            axes.errorbar(group["discharge"], error, beside, fmt=".", color=colour, lw=0.8, label=knows)
-        axes.axhline(0.0, color="black", lw=0.6)
-        axes.set(title=CELLS[str(cell)], xlabel="discharge", ylabel="error of the end, half seen (%)")
+        draw_ends(axes, coloured(of_cell.groupby("knows", sort=False)), CELLS[str(cell)])
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     return figure
 

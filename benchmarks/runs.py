@@ -61,8 +61,9 @@ from sb3_lac.vec_env import steps_as_one_batch
 
 #: A policy is judged so often while it is trained, at even distances, of which the last is the end.
 POINTS = 10
-#: The column of the last time.
-AT_THE_END = "after_100_percent"
+#: The column of each time, by percent of the training, and of the last one.
+CURVE = {100 * point // POINTS: f"after_{100 * point // POINTS}_percent" for point in range(1, POINTS + 1)}
+AT_THE_END = CURVE[100]
 #: What is lost at most when a training is killed.
 CHECKPOINT_EVERY_S = 120.0
 #: Packages that are known by their release, and not by their files.
@@ -105,25 +106,15 @@ def registered_id(env_id: str) -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """
-    One training.
+    """One training."""
 
-    :param task: id of the environment, as ``module:id`` if importing that module registers it
-    :param algorithm: the name of class and settings together
-    :param kind: the class, ``package:Class``
-    :param seed: seed of everything
-    :param timesteps: environment steps
-    :param settings: what differs from the defaults of the class, as in a file of ``zoo_configs``
-    :param environment: arguments of the environment
-    """
-
-    task: str
-    algorithm: str
-    kind: str
+    task: str  # id of the environment, as module:id if importing that module registers it
+    algorithm: str  # the name of class and settings together
+    kind: str  # the class, package:Class
     seed: int
     timesteps: int
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    environment: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)  # that are no defaults, as in a file of zoo_configs
+    environment: Mapping[str, Any] = field(default_factory=dict)  # arguments of it
 
     @property
     def key(self) -> dict[str, Any]:
@@ -170,12 +161,7 @@ class Run:
         return self.settings.get("n_envs", 1)
 
     def environments(self, n_envs: int | None = None, **options: Any) -> VecEnv:
-        """
-        Copies of its environment, stepped by one call where that can be done.
-
-        :param n_envs: how many, as many as it is trained in by default
-        :param options: of the environment, in place of those that it is trained with
-        """
+        """Copies of its environment, with its arguments or others, stepped by one call where that can be done."""
         n_envs, arguments = n_envs or self.n_envs, options or self.environment
         spec, wrapper = gym.spec(registered_id(self.task)), self.settings.get("env_wrapper")
         if wrapper is None and steps_as_one_batch(spec):
@@ -195,7 +181,7 @@ class Run:
             elif isinstance(value, list):
                 settings[name] = tuple(value)  # of steps or episodes between updates
             elif name in ("policy_kwargs", "replay_buffer_kwargs"):
-                settings[name] = _evaluated(value)
+                settings[name] = dict(_evaluated(value))  # algorithms write into it
         if (noise := settings.pop("noise_type", None)) is not None:
             n_actions = gym.spaces.flatdim(env.action_space)
             std = np.full(n_actions, settings.pop("noise_std"))
@@ -213,10 +199,6 @@ def _version(module: str) -> str:
     """Name a module by its release, or the one to come, and a module of one's own by its source."""
     if module in RELEASED:
         return f"{module} {importlib.import_module(module).__version__.partition('.dev')[0]}"
-    return f"{module} {_digest_of_source(module)}"
-
-
-def _digest_of_source(module: str) -> str:
     try:
         file = Path(inspect.getfile(importlib.import_module(module)))
     except TypeError as error:
@@ -228,20 +210,15 @@ def _digest_of_source(module: str) -> str:
         while (top.parent / "__init__.py").exists():
             top = top.parent
         files = [path for path in sorted(top.rglob("*.py")) if (path.parent / "__init__.py").exists()]
-    return digest_of(
-        {path.relative_to(top).as_posix(): sha256(path.read_bytes()).hexdigest() for path in files} | own_versions()
-    )
+    digests = {path.relative_to(top).as_posix(): sha256(path.read_bytes()).hexdigest() for path in files}
+    return f"{module} {digest_of(digests | own_versions())}"
 
 
+@dataclass(frozen=True)
 class Rows:
-    """
-    The trainings that are done, in a table that several commands may add to.
+    """The trainings that are done, in a table of a folder that several commands may add to."""
 
-    :param folder: where the table lies, ``runs.csv`` or, of many rows, ``runs.csv.gz``
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    folder: Path
 
     def read(self, types: Any = None) -> pd.DataFrame:
         """All rows; none if there is no file yet."""
@@ -269,18 +246,6 @@ class Rows:
             write_csv(self.folder, "runs", table.drop_duplicates(_KEY).to_csv(index=False))
 
 
-def save_checkpoint(model: BaseAlgorithm, file: Path, progress: Mapping[str, Any]) -> None:
-    """Write all that a training needs to go on as one file, which takes the place of the one before as a whole."""
-    saves: dict[str, Callable[[BytesIO], None]] = {"model.zip": model.save}
-    if isinstance(model, OffPolicyAlgorithm):
-        saves["replay_buffer.pkl"] = model.save_replay_buffer
-    with replacing(file) as part, ZipFile(part, "w") as archive:
-        for name, save in saves.items():
-            save(content := BytesIO())
-            archive.writestr(name, content.getvalue())
-        archive.writestr("progress.json", json.dumps(progress))
-
-
 class OutOfTimeError(Exception):
     """The time of a training is over before the training is, and what it has learned lies in its checkpoint."""
 
@@ -290,21 +255,13 @@ Judge = Callable[[Any, Run], Any]
 
 
 class Progress(BaseCallback):
-    """
-    Judges a policy while it is trained, and keeps checkpoints.
-
-    :param run: the training
-    :param file: the checkpoint
-    :param judge: what judges the model, if anything does
-    :param deadline: when to stop, as ``time.time()`` has it
-    """
+    """Judges a policy while it is trained, and keeps checkpoints; at a deadline, as ``time.time()`` has it, it stops."""
 
     def __init__(self, run: Run, file: Path, judge: Judge | None = None, deadline: float = np.inf) -> None:
         super().__init__()
         self.run, self.file, self.judge, self.deadline = run, file, judge, deadline
-        #: What the judge said, at even distances
-        self.curve: list[Any] = []
-        #: Wall time without that of the judge, and how often the training went on from a checkpoint
+        self.curve: list[Any] = []  # what the judge said, at even distances
+        # wall time without that of the judge, and how often the training went on from a checkpoint
         self.seconds, self.resumed = 0.0, 0
 
     def _on_training_start(self) -> None:
@@ -338,7 +295,15 @@ class Progress(BaseCallback):
         self._last = time.perf_counter()
 
     def _save(self) -> None:
-        save_checkpoint(self.model, self.file, {"curve": self.curve, "seconds": self.seconds, "resumed": self.resumed})
+        saves: dict[str, Callable[[BytesIO], None]] = {"model.zip": self.model.save}
+        if isinstance(self.model, OffPolicyAlgorithm):
+            saves["replay_buffer.pkl"] = self.model.save_replay_buffer
+        progress = {"curve": self.curve, "seconds": self.seconds, "resumed": self.resumed}
+        with replacing(self.file) as part, ZipFile(part, "w") as archive:
+            for name, save in saves.items():
+                save(content := BytesIO())
+                archive.writestr(name, content.getvalue())
+            archive.writestr("progress.json", json.dumps(progress))
         self._saved = time.perf_counter()
 
     def resume(self, env: VecEnv) -> BaseAlgorithm:
@@ -357,14 +322,7 @@ class Progress(BaseCallback):
 def train(
     progress: Progress, compiled: bool = False, callbacks: Sequence[BaseCallback] = (), log: Path | None = None
 ) -> BaseAlgorithm:
-    """
-    Train on one thread of the CPU, from the checkpoint if there is one.
-
-    :param progress: judges and keeps checkpoints
-    :param compiled: whether updates are compiled where they can be, which changes no result but the time
-    :param callbacks: of the training
-    :param log: folder for TensorBoard
-    """
+    """Train on one thread of the CPU, from the checkpoint if there is one; to compile updates changes nothing but the time."""
     th.set_num_threads(1)
     run = progress.run
     with closing(run.environments()) as env:
@@ -385,17 +343,7 @@ def train_or_load(
     compiled: bool = False,
     log: Path | None = None,
 ) -> BaseAlgorithm:
-    """
-    Train one policy and keep it, with what made it beside it, or load it if that has been done.
-
-    :param run: the training
-    :param folder: for the model, its record and its checkpoint
-    :param judge: what judges the model while it is trained
-    :param callbacks: see :func:`train`
-    :param compiled: see :func:`train`
-    :param log: folder for TensorBoard, that of the model by default
-    :raises RuntimeError: if another process is busy with the same training
-    """
+    """Train one policy and keep it in a folder, with what made it beside it, or load it if that has been done."""
     folder.mkdir(parents=True, exist_ok=True)
     record = record_file(run, folder)
     try:
@@ -435,21 +383,12 @@ def made_by(run: Run, folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Trainer:
-    """
-    Makes rows, in any process.
+    """Makes rows, in any process."""
 
-    :param folder: where the table of rows lies
-    :param checkpoints: folder of the trainings in progress
-    :param judge: gives the model of a training a number, while it is trained
-    :param describe: gives it more of them in the end, by name
-    :param deadline: when trainings stop, with a checkpoint, as ``time.time()`` has it
-    :param compiled: whether updates are compiled where they can be, which changes no result but the time
-    """
-
-    folder: Path
+    folder: Path  # of the table of rows
     checkpoints: Path
     judge: Judge
-    describe: Judge | None = None
+    describe: Judge | None = None  # more numbers of a model in the end, by name
     deadline: float = np.inf
     compiled: bool = False
 
@@ -469,7 +408,7 @@ class Trainer:
         machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
         provenance = {"minutes": progress.seconds / 60.0, "resumed": progress.resumed, "machine": machine}
         provenance["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
-        curve = {f"after_{100 * point // POINTS}_percent": value for point, value in enumerate(progress.curve, 1)}
+        curve = dict(zip(CURVE.values(), progress.curve, strict=False))
         row = {**run.key, **curve, **(self.describe(model, run) if self.describe else {}), **provenance}
         Rows(self.folder).add(pd.DataFrame([row]))
         progress.file.unlink(missing_ok=True)
@@ -489,12 +428,7 @@ def rows_command_line(name: str, document: str | None, timesteps: str) -> argpar
 
 
 def make_rows(study: Study, runs: Sequence[Run], judge: Judge, describe: Judge | None = None) -> pd.DataFrame:
-    """
-    Make the rows of ``<out>/runs.csv`` that are missing, in their order, and return those of each task and algorithm that then
-    has all of its seeds: fewer would make a table of another kind.
-
-    :raises SystemExit: if none has them yet
-    """
+    """Make the rows of a study that are missing, and return those of each task and algorithm that then has all its seeds."""
     chosen = study.chosen
     for name in ("minutes", "checkpoints", "merge"):
         del study.configuration[name]  # which change no row
@@ -507,6 +441,7 @@ def make_rows(study: Study, runs: Sequence[Run], judge: Judge, describe: Judge |
         trainer = Trainer(study.out, chosen.checkpoints, importable(judge), describe, deadline, chosen.compile)
         study.each(trainer, [(run,) for run in runs if not rows.has(run)])
     rows_of_runs = rows.of(runs)
+    # fewer seeds would make a table of another kind
     complete = rows_of_runs[rows_of_runs.groupby(["task", "algorithm"])["seed"].transform("nunique") == len(set(chosen.seeds))]
     if complete.empty:
         raise SystemExit("No algorithm has all of its seeds on a task yet: the same command goes on from the checkpoints.")

@@ -158,10 +158,7 @@ def measure_gpu(rounds: int) -> tuple[pd.DataFrame, str]:
 
 
 def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
-    """
-    Calibrators that follow a stream of one sample a second, here and in progpy: both parameters unknown here, and ``q_mobile``
-    alone in progpy. A policy decides once a minute, on all readings so far; the networks are untrained, which takes as long.
-    """
+    """Calibrators that follow a stream of one sample a second, here and in progpy, which knows ``r_o``."""
     from benchmarks.progpy_filters import ProgpyFilter  # heavy, and needed here only
     from sb3_lac.onnx import export_onnx
 
@@ -170,6 +167,7 @@ def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
         discharge, voltage_V=discharge.voltage_V + np.random.default_rng(0).normal(0.0, 0.005, len(discharge.time_s))
     )
     samples = list(Stream.of(record.part(0, _SAMPLES), 1.0).samples())
+    # untrained networks take as long
     model = LAC("MlpPolicy", _POLICY_ENV, buffer_size=1, policy_kwargs={"net_arch": [256, 256, 256]}, device="cpu", seed=0)
 
     def stream(estimator: OnlineEstimator) -> int:

@@ -23,12 +23,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -46,9 +44,8 @@ from benchmarks.control import (
     conditions,
     controllers,
     judge,
-    roll_out,
-    shares_of,
     tried,
+    tried_with,
 )
 from benchmarks.runs import Run, control_networks, made_by, train_or_load
 from benchmarks.study import (
@@ -69,32 +66,21 @@ from benchmarks.study import (
     with_interval,
 )
 from benchmarks.zoo_runs import zoo_run
-from sb3_lac.envs import CostEnv
 from sb3_lac.stability.plots import format_log_axis
 from sb3_lac.stability.rollout import SETTLED_SHARE
 
 
 @dataclass(frozen=True)
 class Contender:
-    """
-    An algorithm with settings.
-
-    :param algo: the algorithm, see :func:`benchmarks.zoo_runs.zoo_run`
-    :param label: what it is called in tables and figures
-    :param colour: of its curves
-    :param marker: of its curves
-    :param settings_of: whose ``default`` entry of ``zoo_configs`` it has in place of its own for each problem
-    :param differing: hyperparameters that are not those of the entry
-    :param defaults: whether it is ``ALGO("MlpPolicy", env_id)`` as typed
-    """
+    """An algorithm with settings, and how it is drawn."""
 
     algo: str
     label: str
     colour: str
     marker: str
-    settings_of: str | None = None
-    differing: Mapping[str, Any] = field(default_factory=dict)
-    defaults: bool = False
+    settings_of: str | None = None  # whose default entry of zoo_configs it has in place of its own for each problem
+    differing: Mapping[str, Any] = field(default_factory=dict)  # hyperparameters that are not those of the entry
+    defaults: bool = False  # whether it is ALGO("MlpPolicy", env_id) as typed
 
     def run(self, env_id: str, seed: int, timesteps: int | None) -> Run:
         """Return the training."""
@@ -136,10 +122,8 @@ def while_training(model: BaseAlgorithm, run: Run) -> dict[str, float]:
 
 
 def _cost_of(policy: PolicyPredictor, env_id: str) -> dict[str, float]:
-    outcome = roll_out(policy, partial(gym.make, env_id), _CURVE_EPISODES, seed=_CURVE_SEED)
-    problem = gym.make(env_id).unwrapped
-    assert isinstance(problem, CostEnv)
-    return {"cost": outcome["cost"].mean(), "at_goal": shares_of(outcome, problem.error_tolerance)["at_goal"]}
+    outcome = tried_with(policy, env_id, _CURVE_EPISODES, {}, seed=_CURVE_SEED)
+    return {name: outcome[name] for name in ("cost", "at_goal")}
 
 
 def trained(run: Run, models: Path, compiled: bool) -> tuple[BaseAlgorithm, dict[str, Any], pd.DataFrame]:
@@ -290,10 +274,7 @@ def report(tables: Tables) -> str:
 
 
 def plot_learning(learning: pd.DataFrame) -> Figure:
-    """
-    Cost of the mean action while policies are trained, one panel per environment: the interquartile mean over seeds in a band
-    from the least to the most of a seed, and the reference controller.
-    """
+    """Cost of the mean action while policies are trained: interquartile mean, least and most over seeds, and references."""
     envs = list(learning["environment"].unique())
     figure, panels = new_panels(len(envs), 3, (3.1, 2.3), margin=(0.0, 0.4))
     for axes, env_id in zip(panels, envs, strict=True):

@@ -197,35 +197,23 @@ def markdown(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> str:
     return pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True) + "\n"
 
 
-#: What a cell says of rows of results, or of one of their columns; of a single row also a template with names of columns.
-Cell = tuple[str, Callable[[Any], Any]] | Callable[[Any], Any] | str
+#: What a cell says of rows of results, or of one of their columns.
+Cell = tuple[str, Callable[[Any], Any]] | Callable[[Any], Any]
 
 
 def table_of(rows: pd.DataFrame, by: Sequence[str] | Mapping[str, str], cells: Mapping[str, Cell]) -> pd.DataFrame:
-    """
-    A table with a row for each group of rows, in their order.
+    """Tabulate groups of rows, by columns and what readers call them where that is another name, one row a group."""
 
-    :param rows: of results
-    :param by: columns whose values name a group, and what readers call each if it is another name
-    :param cells: what is said of a group, by title
-    """
+    def said_of(group: pd.DataFrame, cell: Cell) -> Any:
+        return cell[1](group[cell[0]]) if isinstance(cell, tuple) else cell(group)
+
     titles = by if isinstance(by, Mapping) else dict(zip(by, by, strict=True))
-    groups = rows.groupby(list(titles), sort=False, dropna=False)
-    return pd.DataFrame([dict(zip(titles.values(), keys, strict=True)) | _cells_of(cells, group) for keys, group in groups])
-
-
-def row_by_row(rows: pd.DataFrame, cells: Mapping[str, Cell]) -> pd.DataFrame:
-    """A table with what is said of each row, by title."""
-    return pd.DataFrame([_cells_of(cells, row) for row in rows.to_dict("records")])
-
-
-def _cells_of(cells: Mapping[str, Cell], of: Any) -> dict[str, Any]:
-    def cell_of(cell: Cell) -> Any:
-        if isinstance(cell, str):
-            return cell.format_map(of)
-        return cell[1](of[cell[0]]) if isinstance(cell, tuple) else cell(of)
-
-    return {title: cell_of(cell) for title, cell in cells.items()}
+    return pd.DataFrame(
+        [
+            dict(zip(titles.values(), keys, strict=True)) | {title: said_of(group, cell) for title, cell in cells.items()}
+            for keys, group in rows.groupby(list(titles), sort=False, dropna=False)
+        ]
+    )
 
 
 def of_trained(cell: Callable[[pd.DataFrame], str]) -> Callable[[pd.DataFrame], str]:
@@ -276,10 +264,7 @@ def run_named(
 
 
 def command_line(name: str, document: str | None, jobs: int | None = 2) -> argparse.ArgumentParser:
-    """
-    Make the command line of a study, with what all have in common: ``--jobs``, ``--scheduler``, ``--redraw`` and ``--out``.
-    The name is that of the module, and of the study if the module has several.
-    """
+    """Make the command line of a study by the name of its module (and its own), with the options that all have in common."""
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks.{name}", description=document, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -293,14 +278,7 @@ def command_line(name: str, document: str | None, jobs: int | None = 2) -> argpa
 
 
 class Study:
-    """
-    One call of a study: what was chosen, its parts, its files.
-
-    :param parser: see :func:`command_line`
-    :param arguments: of the command line by default
-    :ivar chosen: what was chosen on the command line
-    :ivar configuration: what results depend on, written beside them; all that was chosen but where and how parts are made
-    """
+    """One call of a study: what was chosen, its parts, its files."""
 
     def __init__(self, parser: argparse.ArgumentParser, arguments: Sequence[str] | None = None) -> None:
         words = sys.argv[1:] if arguments is None else list(arguments)
@@ -317,6 +295,7 @@ class Study:
             parser.error(str(error))
         self.scheduler: str | None = vars(self.chosen).get("scheduler")
         self.redraws: bool = vars(self.chosen).get("redraw", False)
+        # what results depend on, written beside them: not where and how parts are made
         self.configuration: dict[str, Any] = {
             name: value for name, value in vars(self.chosen).items() if name not in ("jobs", "scheduler", "redraw", "out")
         }
@@ -329,11 +308,7 @@ class Study:
                 parser.error(str(error))
 
     def run(self, part: Callable[..., Tables], parts: Sequence[Mapping[str, Any]], **places: Any) -> dict[str, pd.DataFrame]:
-        """
-        Make all parts, those that were made before from their files in ``<out>/parts``. Such a file stands for its arguments,
-        the module of the function, and the versions of this project's packages; what the function needs beside them it has
-        to keep itself. To redraw, no part is made: the tables are those that are written.
-        """
+        """Make all parts that have no file in ``<out>/parts``; to redraw none, as the tables are those that are written."""
         if self.redraws:
             written = read_tables(self.out)
             # a text that is empty comes back as one
@@ -360,7 +335,7 @@ class Study:
         ]
 
     def _file_of(self, part: Callable[..., Tables], arguments: Mapping[str, Any]) -> Path:
-        """The file that stands for a part."""
+        """The file that stands for a part: for its arguments, the module of its function, and this project's versions."""
         module = Path(inspect.getfile(part)).read_text(encoding="utf-8")
         made_from = {"part": part.__name__, "arguments": arguments, "module": module, "versions": own_versions()}
         return self.out / "parts" / f"{part.__name__}_{digest_of(made_from)}.json"
@@ -371,12 +346,7 @@ class Study:
         runs: Sequence[tuple[Any, ...]],
         keep: Callable[[int, Result], None] | None = None,
     ) -> list[Result]:
-        """
-        Call a function with each of several arguments, with a progress bar: on the cluster, or as many at the same time as
-        was chosen, in processes of their own, or all in this one if one at a time. A call that fails stops no other; its
-        error is raised when all are done. Calls whose process is lost are made once more, each in a process of its own. An
-        interruption ends the program with a word on what is done.
-        """
+        """Call a function with each of several arguments; an error is raised when all others are done."""
         results: dict[int, Result] = {}
         errors = []
         goes_on = f"what is done lies in {self.out}, and the same command goes on from there."
@@ -400,7 +370,7 @@ class Study:
     def _calls(
         self, function: Callable[..., Result], runs: Sequence[tuple[Any, ...]]
     ) -> Generator[tuple[int, Callable[[], Result]]]:
-        """The number of each run with what gives its result: as they are done elsewhere, or as they are to be done here."""
+        """The number of each run with what gives its result: on the cluster, in processes, or in this one if one at a time."""
         if self.scheduler is None and self.chosen.jobs == 1:
             yield from ((number, partial(function, *run)) for number, run in enumerate(runs))
         elif runs:
@@ -436,10 +406,7 @@ def importable(function: Callable[..., Result]) -> Callable[..., Result]:
 
 
 def recall(file: Path) -> dict[str, Any] | None:
-    """
-    Read the file that is written last of something that is done; None if there is none. A damaged file is set aside, and its
-    content is made again.
-    """
+    """Read the file that is written last of something that is done; None if there is none, or a damaged one, set aside."""
     if not file.exists():
         return None
     try:

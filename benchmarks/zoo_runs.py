@@ -22,11 +22,7 @@ _LABELS = {"PublishedLAC": "LAC as published"}
 
 
 def kind_of(algo: str) -> str:
-    """
-    The class of an algorithm, ``package:Class``.
-
-    :param algo: name as in the RL Zoo, like ``published_lac``, or ``package.module:Class``
-    """
+    """The class, ``package:Class``, of an algorithm by its name in the RL Zoo, like ``published_lac``, or by its own."""
     if ":" in algo:
         module, _, name = algo.partition(":")
         try:
@@ -61,18 +57,8 @@ def zoo_run(
     label: str | None = None,
 ) -> Run:
     """
-    A training with the entry of ``zoo_configs`` for the environment.
-
-    :param algo: see :func:`kind_of`
-    :param env_id: id of the environment, as ``module:id`` if importing that module registers it
-    :param seed: seed of everything
-    :param timesteps: environment steps, as many as the entry says by default
-    :param updates: gradient steps in place of them, with one call of ``train()`` per step of all environments
-    :param differing: hyperparameters that are not those of the entry
-    :param settings_of: the algorithm whose ``default`` entry it has, in place of its own for the environment
-    :param defaults: whether it is ``ALGO("MlpPolicy", env_id)`` as typed, without an entry
-    :param label: what readers call algorithm and settings together, the class and the defaults by default
-    :raises ValueError: if there is no such algorithm, environment or entry, or nothing would be learned
+    A training with the entry of ``zoo_configs`` for the environment, the ``default`` entry of another algorithm
+    (``settings_of``), or as typed (``defaults``); ``updates`` are gradient steps that stand for environment steps.
     """
     if not 0 <= seed < 2**32:
         raise ValueError(f"a seed must lie within 0 .. 2**32 - 1, got {seed}")

@@ -31,7 +31,7 @@ def rows(**returns):
     """Rows of five seeds, by algorithm."""
     curves = [
         {"task": "Pendulum-v1", "algorithm": name, "seed": seed, "timesteps": 20_000, "package": "p 1", "configuration": "{}"}
-        | {column: value * percent / 100 for percent, column in outside._CURVE.items()}
+        | {column: value * percent / 100 for percent, column in outside.CURVE.items()}
         for name, values in returns.items()
         for seed, value in enumerate(values, 1)
     ]

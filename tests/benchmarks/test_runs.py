@@ -112,6 +112,14 @@ def test_what_is_compiled_and_how_large_the_buffer_is_is_no_part_of_a_run(monkey
     env.close()
 
 
+def test_a_run_has_its_name_before_and_after_the_training():
+    run = replace(RUN, settings={**SETTINGS, "policy_kwargs": {"net_arch": [4]}})
+    name, env = run.name, run.environments()
+    run.model(env)
+    env.close()
+    assert run.name == name and run.settings["policy_kwargs"] == {"net_arch": [4]}
+
+
 def test_the_setting_of_lac_is_that_of_its_file():
     run = replace(RUN, settings=runs.setting_of_lac(root=4))
     env = run.environments()
