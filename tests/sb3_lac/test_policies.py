@@ -203,3 +203,12 @@ def test_any_numbers_load_as_weights_as_into_policies_of_sb3(make_model):
     drawn = {name: th.rand_like(value) for name, value in policy.state_dict().items()}
     policy.load_state_dict(drawn)
     assert all(th.equal(value, drawn[name]) for name, value in policy.state_dict().items())
+
+
+def test_weights_of_0_7_0_keep_their_root(make_model):
+    weights = make_model(n_collect=0, policy_kwargs={"root": 2}).policy.state_dict()
+    for critic in ("critic", "critic_target"):
+        weights[f"{critic}._extra_state"] = th.tensor(int(weights.pop(f"{critic}.root_degree")))
+    policy = make_model(n_collect=0).policy
+    policy.load_state_dict(weights)
+    assert policy.critic.degree == policy.critic_target.degree == 2
