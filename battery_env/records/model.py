@@ -100,9 +100,9 @@ class ModelError(NamedTuple):
 
     def removed_from(self, record: Record, q_mobile: float) -> Record:
         """Return a record of a discharge alike without this error."""
-        samples = Samples.of(record)
-        drawn_share = integrate_load(samples.time_s, samples.current_A, samples.time_s) / q_mobile
-        return samples._replace(voltage_V=samples.voltage_V - np.interp(drawn_share, *self))
+        time_s, voltage_V, current_A = Samples.of(record)
+        drawn_share = integrate_load(time_s, current_A, time_s) / q_mobile
+        return Samples(time_s, voltage_V - np.interp(drawn_share, *self), current_A)
 
 
 class Tangents(NamedTuple):
