@@ -7,6 +7,15 @@ import time
 from contextlib import contextmanager
 
 
+def until(is_so, patience_s=60.0):
+    """Wait for other processes."""
+    ends = time.monotonic() + patience_s
+    while not is_so():
+        if time.monotonic() > ends:
+            raise TimeoutError
+        time.sleep(0.02)
+
+
 @contextmanager
 def a_full_disk(after_bytes):
     """No file grows beyond so many bytes, for whoever writes it, compiled code too."""

@@ -3,17 +3,16 @@
 import json
 from pathlib import Path
 
-import pandas as pd
 import pytest
 
 from battery_env.lab.command_line import calibrate
 from battery_env.records.samples import Record
+from tests.records import table_of
 
 
 def write(record: Record, path: str | Path) -> str:
     """A table of a record, with the names of this package."""
-    columns = {"time_s": record.time_s, "voltage_V": record.voltage_V, "current_A": record.current_A}
-    pd.DataFrame(columns).to_csv(path, index=False)
+    table_of(record).to_csv(path, index=False)
     return str(path)
 
 

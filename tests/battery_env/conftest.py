@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from battery_env import __file__ as package
 from battery_env.loads import RandomPiecewise
 from battery_env.tasks.voltage.readings import Readings
 from battery_env.trajectories import TrajectoryDataset
+from tests.faults import until
 from tests.terminal import Terminal
 
 
@@ -104,14 +104,6 @@ class StartedPage:
         with suppress(TimeoutError):
             until(lambda: not list(self.temporary.iterdir()), 10)
         return [str(each) for place in (self.home, self.temporary) for each in place.rglob("*")]
-
-
-def until(is_so, patience_s=60):
-    ends = time.monotonic() + patience_s
-    while not is_so():
-        if time.monotonic() > ends:
-            raise TimeoutError
-        time.sleep(0.1)
 
 
 @pytest.fixture

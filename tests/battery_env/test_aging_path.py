@@ -202,13 +202,12 @@ class TestPrior:
         assert found.settled and not early.settled
         assert found.q_mobile == pytest.approx(LeastSquares(mismatch_V=0.05).estimate(whole).q_mobile, rel=0.015)
 
+    @pytest.mark.filterwarnings("error::RuntimeWarning")
     @pytest.mark.parametrize("share", sweep(1.0, 0.3))
     @pytest.mark.parametrize("size", sweep(2.8, 0.3, 1.0, 4.0, 10.0))
     def test_a_cell_of_any_size_has_an_answer_and_of_another_one_it_is_not_settled(self, b0006, size, share):
         made = simulate(2.0 * size, 6000.0 * size, 0.0, load_unit="current", cut_off_V=2.7)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", RuntimeWarning)
-            estimate = LeastSquares(path=b0006).estimate(until(every_tenth(made), share))
+        estimate = LeastSquares(path=b0006).estimate(until(every_tenth(made), share))
         assert np.isfinite(estimate.q_mobile) and not estimate.settled
 
     @pytest.mark.parametrize("share", sweep(0.5, 0.1, 0.9))

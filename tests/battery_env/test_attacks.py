@@ -19,6 +19,7 @@ from battery_env.lab.calibrate import calibrated
 from battery_env.policies.pretrained import pretrained_ids
 from battery_env.records import Samples
 from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES
+from tests.records import recorded as as_recorded
 from tests.sweeps import sweep
 
 WRONG_SHARE = 0.05
@@ -205,7 +206,7 @@ def outcome(case: Case, make: object, record: Discharge | Case | None = None) ->
             if record is None:
                 record = case
                 if case.recorded:
-                    record = Discharge(case.time_s, case.voltage_V, case.current_A)
+                    record = as_recorded(case)
             estimate = make().estimate(record)
     except (TypeError, ValueError):
         return "refused", None
@@ -305,7 +306,7 @@ def swept_answers(case: Case, fault: str) -> list[tuple[object, ...]]:
             record: Discharge | Case = faulty
             if case.recorded:
                 try:
-                    record = Discharge(faulty.time_s, faulty.voltage_V, faulty.current_A).loaded_part(2.7)
+                    record = as_recorded(faulty).loaded_part(2.7)
                 except ValueError:
                     continue
             answers.append((size, place, *outcome(faulty, calibrators(faulty)["least squares"], record)))

@@ -12,6 +12,7 @@ from battery_env.estimates.findings import Doubt
 from battery_env.estimators.diagnosis.evidence import evidence_of
 from battery_env.records import ChargeBefore, ChargeHistory, Samples
 from battery_env.records.load import switched_charge
+from tests.records import recorded
 from tests.sweeps import sweep
 
 TRUE_Q_C, TRUE_R_OHM, LOAD_A = 7000.0, 0.12, 2.0
@@ -29,10 +30,10 @@ def discharged(every_s: float, rest_s: float, switch_s: float, soc: float = 1.0)
     return Discharge(time_s - time_s[0], voltage_V, current_A)
 
 
-def is_right(found, q_mobile_C: float = TRUE_Q_C, r_o_ohm: float = TRUE_R_OHM) -> bool:
+def is_right(found) -> bool:
     """Whether each number that is settled is right, within 5 % or 3 standard deviations."""
-    right_q = abs(found.q_mobile_C - q_mobile_C) <= max(0.05 * q_mobile_C, 3.0 * found.sd_q_mobile_C)
-    right_r_o = abs(found.r_o_ohm - r_o_ohm) <= max(0.05 * r_o_ohm, 3.0 * found.sd_r_o_ohm)
+    right_q = abs(found.q_mobile_C - TRUE_Q_C) <= max(0.05 * TRUE_Q_C, 3.0 * found.sd_q_mobile_C)
+    right_r_o = abs(found.r_o_ohm - TRUE_R_OHM) <= max(0.05 * TRUE_R_OHM, 3.0 * found.sd_r_o_ohm)
     return (right_q or not found.settled_q_mobile) and (right_r_o or not found.settled_r_o)
 
 
@@ -51,8 +52,7 @@ class TestLoadOn:
     def test_rows_that_are_lost_around_it_are_a_doubt_of_their_size_and_no_refusal(self, lost_s):
         whole = discharged(10.0, 300.0, 5.0)
         kept = (whole.time_s < 250.0) | (whole.time_s > 250.0 + lost_s)
-        record = Discharge(whole.time_s[kept], whole.voltage_V[kept], whole.current_A[kept])
-        found = calibrate(record)
+        found = calibrate(recorded(whole, kept))
         assert found.settled_q_mobile == (lost_s < 200.0) and is_right(found)
         assert abs(found.drawn_Ah - whole.charge_C / 3600.0) * 3600.0 < 2.5 * found.record.history.load_on_C + LOAD_A * 10.0
 
@@ -83,11 +83,8 @@ class TestRest:
         assert not (is_large and found.settled_q_mobile)
 
     def test_a_small_load_before_a_larger_one_is_none(self):
-        current_A = REAL.current_A.copy()
-        current_A[:2] = 0.15
-        assert Discharge(REAL.time_s, REAL.voltage_V, current_A).loaded_part(2.7).history.offset_A == pytest.approx(
-            0.0, abs=0.01
-        )
+        drawn = replace(REAL, current_A=np.append([0.15, 0.15], REAL.current_A[2:]))
+        assert drawn.loaded_part(2.7).history.offset_A == pytest.approx(0.0, abs=0.01)
 
 
 def cycled(highest_V: float, last_A: float, rest_rows: int = 0, soc: float = 1.0) -> pd.DataFrame:

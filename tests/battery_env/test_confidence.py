@@ -9,18 +9,16 @@ from battery_env import NEW_CELL, PolicyEstimator, RandomSensorErrors, evaluate,
 from battery_env.records import Samples
 from battery_env.tasks.data import standard_dataset
 from tests.policies import Step
+from tests.records import recorded
 from tests.sweeps import sweep
 
 ENV_ID = "BatteryVoltageJoint-v0"
 OPTIONS = {"nuisance": 0.2, "reading_s": 2.0}
 
 
-def whole_discharge(q_mobile=6000.0, r_o=0.15, load_A=1.5, noise_V=0.002, **more):
-    rng = np.random.default_rng(0)
-    current_A = load_A * (1.0 + 0.5 * (np.arange(30_000) // 90 % 2))
-    record = simulate(current_A, q_mobile, r_o, load_unit="current", cut_off_V=2.8, **more)
-    voltage_V = record.voltage_V + rng.normal(0.0, noise_V, len(record.voltage_V))
-    return Samples(record.time_s, voltage_V, record.current_A)
+def whole_discharge(q_mobile=6000.0, **more):
+    current_A = np.where(np.arange(30_000) // 90 % 2, 2.25, 1.5)
+    return Samples.of(recorded(simulate(current_A, q_mobile, 0.15, load_unit="current", cut_off_V=2.8, **more), noise_V=0.002))
 
 
 WHOLE = whole_discharge()
@@ -95,9 +93,8 @@ STEADY = simulate(np.full(30_000, 2.0), 6000.0, 0.15, load_unit="current", cut_o
 @pytest.mark.parametrize("apart_s", sweep(10, 1, 3, 17, 30, 60))
 def test_it_reads_where_the_samples_are(apart_s):
     """However far apart, and whether the others are not in the record or have no voltage."""
-    noise_V = np.random.default_rng(1).normal(0.0, 0.002, len(STEADY.voltage_V))
-    record = Samples(STEADY.time_s, STEADY.voltage_V + noise_V, STEADY.current_A)
-    kept = np.arange(len(noise_V)) % apart_s == 0
+    record = Samples.of(recorded(STEADY, noise_V=0.002, seed=1))
+    kept = np.arange(len(record.time_s)) % apart_s == 0
     stream, missing_V = estimator(), np.where(kept, record.voltage_V, np.nan)
     for voltage_V, current_A in zip(missing_V.tolist(), record.current_A.tolist(), strict=True):
         streamed = stream.update(voltage_V, current_A, 1.0)

@@ -4,7 +4,6 @@ import csv
 import gzip
 import io
 import re
-import warnings
 
 import numpy as np
 import pandas as pd
@@ -139,7 +138,8 @@ def write(f, folder):
 
 
 @pytest.mark.attacks
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.fixed_dictionaries({name: st.sampled_from(values) for name, values in FEATURES.items()}))
 def test_whatever_is_put_together_the_discharges_are_those_that_were_written(tmp_path, f):
     if f["encoding"] == "latin-1":
@@ -148,16 +148,14 @@ def test_whatever_is_put_together_the_discharges_are_those_that_were_written(tmp
         f |= {"cut": False}
     if f["separator"] == " .":
         f |= {"clock": "time", "beside": set(), "index": False, "cut": False}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        try:
-            found = read_discharges(write(f, tmp_path))
-        except ValueError as refused:
-            # rows that come again and clocks of steps go back; row numbers and words may have no known name
-            assert f["repeated"] or f["clock"] in ("day", "step") or f["index"] or not f["sign"]
-            said = r"the clock goes back: row \d+|rows have|no column for the time|has no sign: from row|must hold numbers"
-            assert re.search(said, str(refused)), refused
-            return
+    try:
+        found = read_discharges(write(f, tmp_path))
+    except ValueError as refused:
+        # rows that come again and clocks of steps go back; row numbers and words may have no known name
+        assert f["repeated"] or f["clock"] in ("day", "step") or f["index"] or not f["sign"]
+        said = r"the clock goes back: row \d+|rows have|no column for the time|has no sign: from row|must hold numbers"
+        assert re.search(said, str(refused)), refused
+        return
     assert len(found) == f["cycles"]
     sd_charge_C = 10.0 * (1 + f["cut"] + (f["edge"] == "mixed"))  # a row that is missing, or of two steps
     for discharge in found:

@@ -7,6 +7,7 @@ from battery_env import NEW_CELL, Discharge, LeastSquares, Settings, calibrate, 
 from battery_env.estimators.diagnosis.evidence import dropouts_of
 from battery_env.estimators.error import ErrorModel
 from battery_env.records import Samples
+from tests.records import recorded
 from tests.sweeps import sweep
 
 
@@ -38,8 +39,7 @@ def test_the_drift_over_a_charge_is_that_of_the_covariance():
 def test_slow_diffusion_of_a_worn_cell_is_taken_for_neither_charge_nor_resistance(slower, kinetics, prior_C):
     cell = NEW_CELL.replace(tDiffusion=slower * NEW_CELL.tDiffusion, kn=kinetics * NEW_CELL.kn)
     worn = simulate(2.0, 5500.0, 0.13, load_unit="current", thermal=True, cell=cell, cut_off_V=2.7)
-    record = Discharge(worn.time_s[::10], worn.voltage_V[::10], worn.current_A[::10])
-    found = Settings(prior_q_mobile_C=prior_C).calibrator().estimate(record)
+    found = Settings(prior_q_mobile_C=prior_C).calibrator().estimate(recorded(worn, slice(None, None, 10)))
     assert "contradicts" not in found.reason
     assert abs(found.q_mobile - 5500.0) < 3.0 * found.sd_q_mobile and abs(found.r_o - 0.13) < 3.0 * found.sd_r_o
 

@@ -10,6 +10,7 @@ import pytest
 
 from battery_env import NEW_CELL, Estimate, RecordModel, forecast, initial_state, load_nasa_discharges, simulate, track_life
 from battery_env.__main__ import calibrate
+from battery_env.electrochemistry.cell import new_cell_of
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.estimates import Finding
@@ -18,7 +19,7 @@ from battery_env.lab.running import calibrate_running, forecast_end, read_load
 from battery_env.lab.settings import Settings
 from battery_env.loads import BlockBootstrap, Cycle, Load, RandomPiecewise, constant, steadier_unit
 from battery_env.records import Samples, resample_current
-from battery_env.records.discharge import Discharge
+from tests.records import recorded, table_of
 from tests.sweeps import sweep
 from tests.terminal import write
 
@@ -35,10 +36,7 @@ def half(record):
     return record.part(0, len(record.time_s) // 2)
 
 
-def rest_of(record):
-    """The load from the last sample of the half on."""
-    first = len(record.time_s) // 2 - 1
-    return Load(record.time_s[first:] - record.time_s[first], record.load[first:], record.load_unit)
+HALF = half(discharged(4.0, load_unit="current"))
 
 
 def certain(record, load=None, **keywords):
@@ -48,18 +46,18 @@ def certain(record, load=None, **keywords):
 class TestLoads:
     @pytest.mark.parametrize("cut_off_V", [3.2, 2.7])
     def test_a_constant_current_is_the_forecast_of_the_model(self, cut_off_V):
-        record = half(discharged(4.0, load_unit="current"))
-        found = certain(record, cut_off_V=cut_off_V)
+        found = certain(HALF, cut_off_V=cut_off_V)
         assert found.load_name == "4 A"
-        np.testing.assert_allclose(found.eod_time_s, MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s, atol=1e-6)
+        np.testing.assert_allclose(found.eod_time_s, MODEL.forecast(HALF, TRUTH, cut_off_V).eod_time_s, atol=1e-6)
 
     def test_a_recorded_cell_ends_at_the_same_voltage_as_everywhere(self):
-        found = forecast(half(discharged(4.0, load_unit="current")), TRUTH, samples=3)
+        found = forecast(HALF, TRUTH, samples=3)
         assert found.cut_off_V == Settings().resolved.cut_off_V == 2.7
 
     def test_a_known_profile_ends_when_the_cell_does(self):
         record = discharged(RandomPiecewise((4.0, 12.0))(np.random.default_rng(3)))
-        found = certain(half(record), rest_of(record))
+        last = len(half(record).time_s) - 1
+        found = certain(half(record), Load(record.time_s[last:] - record.time_s[last], record.load[last:], record.load_unit))
         assert (np.abs(found.eod_time_s - record.eod_time_s) <= 8.0).all()
 
     def test_function_cycle_and_profile_are_the_same_load(self):
@@ -91,19 +89,18 @@ class TestLoads:
         assert abs(last_s - record.eod_time_s) > 5.0 * abs(median_s - record.eod_time_s)
 
     def test_a_charge_on_the_way_comes_on_top_and_one_beyond_full_is_refused(self):
-        record = half(discharged(4.0, load_unit="current"))
         back = Load([0.0, 300.0], [-1.0, 4.0], "current")
-        whole = discharged(np.append(record.load[:-1], back(4.0 * np.arange(400))), load_unit="current")
-        assert (np.abs(certain(record, back).eod_time_s - whole.eod_time_s) <= 4.0).all()
+        whole = discharged(np.append(HALF.load[:-1], back(4.0 * np.arange(400))), load_unit="current")
+        assert (np.abs(certain(HALF, back).eod_time_s - whole.eod_time_s) <= 4.0).all()
         beyond = Load([0.0, 3600.0], [-2.0, 4.0], "current")
         # 2 A bring back what 4 A took in twice the time
-        after_s = 2.0 * record.time_s[-1] + 0.01 * 6000.0 / 2.0
+        after_s = 2.0 * HALF.time_s[-1] + 0.01 * 6000.0 / 2.0
         with pytest.raises(ValueError, match="beyond full, by more than 1% of its charge, after") as refused:
-            certain(record, beyond)
+            certain(HALF, beyond)
         assert float(re.search(r"after (\d+) s", str(refused.value))[1]) == pytest.approx(after_s, abs=8.0)
 
     def test_under_a_charge_or_without_a_load_there_is_no_end(self):
-        found = certain(half(discharged(4.0, load_unit="current")), -2.0)
+        found = certain(HALF, -2.0)
         assert np.isinf(found.eod_time_s).all() and np.isnan(found.nominal_Ah)
         current_A = np.where(np.arange(300) < 60, 4.0, 0.0)
         found = certain(discharged(current_A, load_unit="current"))
@@ -113,18 +110,15 @@ class TestLoads:
 
 
 def test_health_is_not_that_of_a_single_draw():
-    record = half(discharged(4.0, load_unit="current"))
     load = RandomPiecewise((1.0, 6.0), (600.0, 2400.0), unit="current")
     settings = {"model": MODEL, "mismatch_V": 0.0, "samples": 100}
-    nominal_Ah = [forecast(record, TRUTH, load, seed=seed, **settings).nominal_Ah for seed in range(5)]
+    nominal_Ah = [forecast(HALF, TRUTH, load, seed=seed, **settings).nominal_Ah for seed in range(5)]
     assert np.ptp(nominal_Ah) < 0.06 * np.mean(nominal_Ah)  # of single draws a third
 
 
 class TestUncertainty:
-    record = half(discharged(4.0, load_unit="current"))
-
     def width(self, estimate, load=None, **keywords):
-        low_s, _, high_s = forecast(self.record, estimate, load, model=MODEL, samples=400, **keywords).eod_quantile_s()
+        low_s, _, high_s = forecast(HALF, estimate, load, model=MODEL, samples=400, **keywords).eod_quantile_s()
         return high_s - low_s
 
     def test_the_interval_is_as_wide_as_what_is_not_known(self):
@@ -146,7 +140,7 @@ class TestUncertainty:
         unsure = Estimate(6000.0, 0.15, 0.0, error_ohm)
         # at the load of the record the voltage makes up for a larger resistance, and at a lighter one for too much
         low_s, high_s = (
-            forecast(self.record, Estimate(6000.0, r_o), 1.0, model=MODEL, mismatch_V=0.05, samples=400).eod_quantile_s(0.5)
+            forecast(HALF, Estimate(6000.0, r_o), 1.0, model=MODEL, mismatch_V=0.05, samples=400).eod_quantile_s(0.5)
             for r_o in 0.15 + error_ohm * np.array([-1.0, 1.0])
         )
         own_s = 3.29 * 0.5 * (high_s - low_s)
@@ -157,15 +151,14 @@ class TestUncertainty:
         assert self.width(unsure, 1.0, mismatch_V=0.05) == pytest.approx(np.hypot(own_s, sure_s), rel=0.1)
         assert self.width(unsure, mismatch_V=0.05) == pytest.approx(self.width(TRUTH, mismatch_V=0.05), rel=0.1)
         # what is told of the resistance is the estimate
-        assert forecast(self.record, unsure, 8.0, model=MODEL).r_o.std() == pytest.approx(error_ohm, rel=0.1)
+        assert forecast(HALF, unsure, 8.0, model=MODEL).r_o.std() == pytest.approx(error_ohm, rel=0.1)
 
     def test_an_offset_that_the_record_shows_goes_on(self):
-        record, cut_off_V = self.record, 3.2
-        higher = Samples(record.time_s, record.voltage_V + 0.05, record.current_A)
-        found = forecast(higher, TRUTH, cut_off_V=cut_off_V, model=MODEL, mismatch_V=0.02, samples=200)
-        lower_s = MODEL.forecast(record, TRUTH, cut_off_V - 0.05).eod_time_s
+        higher = Samples(HALF.time_s, HALF.voltage_V + 0.05, HALF.current_A)
+        found = forecast(higher, TRUTH, cut_off_V=3.2, model=MODEL, mismatch_V=0.02, samples=200)
+        lower_s = MODEL.forecast(HALF, TRUTH, 3.2 - 0.05).eod_time_s
         assert found.eod_quantile_s(0.5) == pytest.approx(lower_s, rel=0.01)
-        assert lower_s > 1.01 * MODEL.forecast(record, TRUTH, cut_off_V).eod_time_s
+        assert lower_s > 1.01 * MODEL.forecast(HALF, TRUTH, 3.2).eod_time_s
 
     def test_a_cell_in_progress_ends_after_its_record_however_low_its_model_came_before(self):
         current_A = np.where(np.arange(750) % 25 < 3, 6.0, 1.0)
@@ -183,9 +176,9 @@ class TestUncertainty:
         assert "contradicts" in found.notes[-1]
 
     def test_what_is_left_out_is_said(self):
-        assert ["leaves theirs out" in note for note in certain(self.record).notes] == [True]
+        assert ["leaves theirs out" in note for note in certain(HALF).notes] == [True]
         unsettled = Estimate(6000.0, 0.15, 60.0, 0.03, False, (Finding("misfit"),))
-        assert "The voltage of the model is farther off" in forecast(self.record, unsettled, model=MODEL, samples=5).summary()
+        assert "The voltage of the model is farther off" in forecast(HALF, unsettled, model=MODEL, samples=5).summary()
 
 
 @pytest.mark.parametrize("q_mobile", [2000.0, 6000.0, 20000.0])
@@ -215,8 +208,7 @@ class TestHealth:
         np.testing.assert_allclose(given.state_of_health, given.capacity_Ah / 2.0)
 
     def test_charge_that_is_left_is_what_was_not_drawn(self):
-        seen = half(discharged(4.0, load_unit="current"))
-        np.testing.assert_allclose(certain(seen).soc, 1.0 - 4.0 * seen.time_s[-1] / 6000.0, rtol=1e-9)
+        np.testing.assert_allclose(certain(HALF).soc, 1.0 - 4.0 * HALF.time_s[-1] / 6000.0, rtol=1e-9)
 
     def test_a_cell_that_starts_partly_charged_is_as_healthy(self):
         full, partly = (
@@ -248,9 +240,8 @@ class TestHealth:
         ],
     )
     def test_what_cannot_be_meant_is_refused(self, keywords, message):
-        record = half(discharged(4.0, load_unit="current"))
         with pytest.raises((TypeError, ValueError), match=message):
-            forecast(**({"record": record, "estimate": TRUTH, "model": MODEL, "samples": 3} | keywords))
+            forecast(**({"record": HALF, "estimate": TRUTH, "model": MODEL, "samples": 3} | keywords))
 
 
 @pytest.mark.parametrize("unit", ["current", "power"])
@@ -311,7 +302,7 @@ class TestCommand:
         monkeypatch.chdir(tmp_path)
         Path("lab").mkdir()
         tables = [
-            pd.DataFrame({"time_s": each.time_s, "voltage_V": each.voltage_V, "current_A": each.current_A, "cycle": n})
+            table_of(each, cycle=n)
             for n, each in enumerate([*self.discharges[:10], self.discharges[10].until(1200.0)], start=1)
         ]
         pd.concat(tables).to_csv("all.csv", index=False)
@@ -351,11 +342,9 @@ class TestCommand:
     @pytest.mark.parametrize("size", sweep(0.3, 0.05, 2.5, 10.0, 100.0))
     @pytest.mark.parametrize("share", sweep(0.5, 0.25, 0.75))
     def test_a_nominal_capacity_tells_what_a_cell_of_another_size_holds(self, size, share):
-        surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
-        cell = with_equilibrium(NEW_CELL.replace(kn=800.0, **surfaces), [-0.03, 0.02, 0.05])
+        cell = with_equilibrium(new_cell_of(size * NEW_CELL.q_mobile).replace(kn=800.0), [-0.03, 0.02, 0.05])
         made = simulate(2.0 * size, 6800.0 * size, 0.1 / size, load_unit="current", cell=cell, cut_off_V=2.7)
-        record = Discharge(made.time_s[::10], made.voltage_V[::10], made.current_A[::10])
-        seen, end_s = record.until(share * made.time_s[-1]), made.time_s[-1]
+        seen, end_s = recorded(made, slice(None, None, 10)).until(share * made.time_s[-1]), made.time_s[-1]
         settings = Settings(nominal_Ah=2.0 * size)
         low_s, median_s, high_s = forecast_end(seen, settings).eod_quantile_s()
         found = calibrate_record(seen, settings)
@@ -365,12 +354,10 @@ class TestCommand:
     @pytest.mark.parametrize("size", sweep(5.0, 1.0, 2.5, 10.0))
     @pytest.mark.parametrize("rate", sweep(1.0, 0.3))
     def test_of_a_larger_cell_that_is_not_stated_nobody_is_sure(self, size, rate):
-        surfaces = {name: size * getattr(NEW_CELL, name) for name in ("Sn", "Sp", "mC")}
-        cell = NEW_CELL.replace(q_mobile=6800.0 * size, r_o=0.15 / size, **surfaces)
-        made = simulate(2.0 * rate * size, load_unit="current", cell=cell, thermal=True)
-        record = Discharge(made.time_s[::10], made.voltage_V[::10], made.current_A[::10])
+        cell = new_cell_of(size * NEW_CELL.q_mobile)
+        made = simulate(2.0 * rate * size, 6800.0 * size, 0.15 / size, load_unit="current", cell=cell, thermal=True)
         for share in (0.1, 0.25, 0.5, 0.75):
-            found = calibrate_record(record.until(share * made.time_s[-1]))
+            found = calibrate_record(recorded(made, slice(None, None, 10)).until(share * made.time_s[-1]))
             # 5 to hundreds, were a prior around a new 18650 all that there is
             assert abs(found.predicted_eod_time_s - made.time_s[-1]) < 4.0 * found.sd_predicted_eod_time_s, share
 

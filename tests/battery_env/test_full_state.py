@@ -1,7 +1,5 @@
 """The tasks with the full state: their environments, their options, and what the joint task shows."""
 
-import warnings
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,6 +11,7 @@ from battery_env.electrochemistry import NEW_CELL, QNB, STATE_NAMES, VO, step
 from battery_env.loads import RandomPiecewise, constant
 from battery_env.tasks.full_state.full_state_task import BatteryJoint, BatteryQmax, BatteryQmaxPaper, BatteryRo
 from battery_env.tasks.full_state.layout import ERROR_SCALE, OBSERVED
+from battery_env.tasks.registration import TASKS
 from battery_env.trajectories import TrajectoryDataset
 
 
@@ -42,16 +41,6 @@ def true_action(task):
     return action_of(task, task.cell_records)
 
 
-def errors_in_scales(task, measured):
-    return dict(
-        zip(
-            STATE_NAMES[OBSERVED],
-            np.abs((task.cell_records["model_state"] - measured)[:, OBSERVED] / ERROR_SCALE).T,
-            strict=True,
-        )
-    )
-
-
 def test_the_defaults_disturb_nothing(discharges):
     task = started(make(discharges))
     for k in range(5):
@@ -77,7 +66,9 @@ def test_a_parameter_is_judged_by_the_voltage_that_shows_it(discharges, kind, vo
     task = started(make(discharges, kind, cells=4, initial_perturbation=8.0))
     for _ in range(3):
         measured = task.cell_records["next_state"].copy()
-        cost, errors = task.advance(np.zeros((4, len(task.parameters)))), errors_in_scales(task, measured)
+        cost = task.advance(np.zeros((4, len(task.parameters))))
+        scaled = np.abs(task.cell_records["model_state"] - measured)[:, OBSERVED] / ERROR_SCALE
+        errors = dict(zip(STATE_NAMES[OBSERVED], scaled.T, strict=True))
         np.testing.assert_allclose(cost, sum(np.minimum(errors[name], 5.0) for name in voltages), rtol=1e-9)
 
 
@@ -162,13 +153,12 @@ def test_cells_whose_constants_are_not_the_models_are_refused():
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("env_id", TASKS)
 def test_both_checkers_are_clean(env_id):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gym.make(env_id, render_mode="rgb_array").unwrapped
-        check_env(env)
-        check_env_sb3(env)
+    env = gym.make(env_id, render_mode="rgb_array").unwrapped
+    check_env(env)
+    check_env_sb3(env)
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -185,12 +175,10 @@ def test_the_true_parameter_costs_nothing_and_any_other_does(env_id):
         assert info["cost"] > 1e-2 and reward == -info["cost"]
 
 
+@pytest.mark.filterwarnings("error")
 def test_ids_are_registered_once_and_work_from_anywhere():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        battery_env.register_environments()
-        env = gym.make("battery_env:BatteryQmax-v0")
-    assert env.spec.id == "BatteryQmax-v0"
+    battery_env.register_environments()
+    assert gym.make("battery_env:BatteryQmax-v0").spec.id == "BatteryQmax-v0"
 
 
 @pytest.mark.parametrize(("env_id", "steps"), [("BatteryQmax-v0", 64), ("BatteryRo-v0", 64), ("BatteryQmaxPaper-v0", 16)])
@@ -236,13 +224,11 @@ def test_the_literal_observation_is_divided_by_the_new_cells_state():
 
 
 def test_the_perturbation_stays_in_its_bounds_and_conserves_charge():
-    env = gym.make("BatteryQmax-v0", initial_perturbation=10.0)
-    scale = ERROR_SCALE
-    draws = []
+    env, draws = gym.make("BatteryQmax-v0", initial_perturbation=10.0), []
     for seed in range(20):
         env.reset(seed=seed)
         cell_records = env.unwrapped.task.cell_records
-        draws.append((cell_records["model_state"] - cell_records["state"])[0, OBSERVED][:4] / scale[:4])
+        draws.append((cell_records["model_state"] - cell_records["state"])[0, OBSERVED][:4] / ERROR_SCALE[:4])
         assert cell_records["model_state"][0, QNB:].sum() == pytest.approx(cell_records["state"][0, QNB:].sum(), rel=1e-12)
     assert np.abs(draws).max() <= 10.0 + 1e-6 and np.abs(draws).max(axis=0).min() > 5.0
 

@@ -16,10 +16,10 @@ from tests.terminal import write
 REST_S = 200
 
 
-def partly_charged(soc: float, noise_V: float = 0.002, load_A: float = 2.0, cut_off_V: float = 2.8):
-    current_A = np.append(np.zeros(REST_S), np.full(20_000, load_A))
+def partly_charged(soc: float, noise_V: float = 0.002):
+    current_A = np.append(np.zeros(REST_S), np.full(20_000, 2.0))
     start = initial_state(6000.0, soc=soc)
-    record = simulate(current_A, 6000.0, 0.15, load_unit="current", thermal=True, initial=start, cut_off_V=cut_off_V)
+    record = simulate(current_A, 6000.0, 0.15, load_unit="current", thermal=True, initial=start, cut_off_V=2.8)
     return SensorErrors(noise_V).apply(record, np.random.default_rng(0))
 
 

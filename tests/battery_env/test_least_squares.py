@@ -11,6 +11,7 @@ from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.search import Prior, Search, SizePrior
 from battery_env.records import Samples
+from tests.records import recorded
 from tests.sweeps import sweep
 
 
@@ -80,9 +81,7 @@ class TestCleanRecords:
     def test_a_record_sampled_now_and_then(self):
         whole = discharged(load=2.0, load_unit="current")
         kept = np.sort(np.random.default_rng(0).choice(len(whole.time_s), 200, replace=False))
-        record = Discharge(whole.time_s[kept], whole.voltage_V[kept], whole.current_A[kept])
-        start = whole.state[kept[0]]
-        estimate = LeastSquares(initial=start).estimate(record)
+        estimate = LeastSquares(initial=whole.state[kept[0]]).estimate(recorded(whole, kept))
         assert (estimate.q_mobile, estimate.r_o) == pytest.approx((6000.0, 0.15), rel=1e-6)
 
 
@@ -114,7 +113,7 @@ class TestNoise:
 
     def test_mismatch_widens_the_deviations_and_more_samples_do_not_narrow_them(self):
         record = discharged(noise_V=0.005)
-        thinned = Discharge(record.time_s[::20], record.voltage_V[::20], record.current_A[::20])
+        thinned = recorded(record, slice(None, None, 20))
         white, doubtful, few = (
             LeastSquares(mismatch_V=mismatch_V).estimate(data)
             for mismatch_V, data in ((0.0, record), (0.05, record), (0.05, thinned))
@@ -169,11 +168,10 @@ OFF = {"kn": 0.7, "tDiffusion": 1.3, "to": 0.8, "tsn": 1.2}
 NUISANCE = dict.fromkeys(OFF, 0.2)
 
 
-def discharged_otherwise(noise_V=0.005, seed=0, factors=OFF, thermal=False):
+def discharged_otherwise(seed=0, factors=OFF, thermal=False):
     """A discharge of a cell whose constants are others than the model's."""
     cell = NEW_CELL.replace(**{name: factor * getattr(NEW_CELL, name) for name, factor in factors.items()})
-    record = simulate(steps(seed), 6000.0, 0.15, cell=cell, thermal=thermal)
-    return SensorErrors(noise_V).apply(record, np.random.default_rng(seed))
+    return discharged(load=steps(seed), noise_V=0.005, seed=seed, cell=cell, thermal=thermal)
 
 
 class TestNuisanceConstants:
@@ -204,8 +202,7 @@ class TestNuisanceConstants:
 
     @pytest.mark.parametrize("thermal", [False, True])
     def test_derivatives_are_exact(self, thermal):
-        record = discharged_otherwise(thermal=thermal)
-        record = Discharge(record.time_s[::7], record.voltage_V[::7], record.current_A[::7])
+        record = recorded(discharged_otherwise(thermal=thermal), slice(None, None, 7))
         nuisance = {**dict.fromkeys(RATE_CONSTANTS, 0.2), "offset_V": 0.01}
         fit = LeastSquares(nuisance=nuisance, thermal=thermal)
         search = Search.of(Samples.of(record), fit.model, fit.parameters, nuisance, fit.bounds)

@@ -13,6 +13,7 @@ from battery_env.estimates import Finding
 from battery_env.lab.life import life_of
 from battery_env.lab.running import forecast_end
 from battery_env.records import ChargeBefore, ChargeHistory
+from tests.records import recorded
 from tests.sweeps import sweep
 
 
@@ -30,10 +31,11 @@ def followed(q_mobile_C, **columns):
     return life_of(table.assign(**{**known, **columns}))
 
 
-def walk(seed, count=150, step=0.01, noise=0.002, drift=-0.002):
+def walk(seed, count=150):
+    """Charges that fall by 0.2 % a discharge, in steps of 1 %, each known to 0.2 %."""
     rng = np.random.default_rng(seed)
-    level = np.cumsum(drift + step * rng.standard_normal(count))
-    return 7000.0 * np.exp(level + noise * rng.standard_normal(count))
+    level = np.cumsum(-0.002 + 0.01 * rng.standard_normal(count))
+    return 7000.0 * np.exp(level + 0.002 * rng.standard_normal(count))
 
 
 class TestSeries:
@@ -177,9 +179,8 @@ class TestRealCell:
 
     def test_what_contradicts_is_left_out_and_the_others_count(self):
         first, second, third, fourth = self.discharges
-        late = Discharge(*(column[second.time_s > 900.0] for column in (second.time_s, second.voltage_V, second.current_A)))
-        dip = np.where(np.arange(len(third.time_s)) == 50, 2.0, third.voltage_V)
-        broken = Discharge(third.time_s, dip, third.current_A)
+        late = recorded(second, second.time_s > 900.0)
+        broken = replace(third, voltage_V=np.where(np.arange(len(third.time_s)) == 50, 2.0, third.voltage_V))
         life = track_life([first, late, broken, fourth.until(2000.0), fourth], cut_off_V=3.2)
         assert life.table["valid"].tolist() == [True, False, False, False, True]
         starts, falls, short = life.table["reason"].iloc[1:4]

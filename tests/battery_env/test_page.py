@@ -15,6 +15,7 @@ from battery_env import NEW_CELL, Settings, calibrate, load_nasa_discharges, rea
 from battery_env import __file__ as package
 from battery_env.lab.life import life_before
 from battery_env.lab.running import forecast_end
+from tests.records import table_of
 
 pytest.importorskip("streamlit")
 pytest.importorskip("plotly")
@@ -25,8 +26,14 @@ LIFE = load_nasa_discharges("B0005")[96:100]
 
 
 def csv(discharge):
-    columns = {"time_s": discharge.time_s, "voltage_V": discharge.voltage_V, "current_A": discharge.current_A}
-    return pd.DataFrame(columns).to_csv(index=False)
+    return table_of(discharge).to_csv(index=False)
+
+
+def show_one_cell(page, folder):
+    """Name a folder whose files are all of one cell, of 2 Ah."""
+    page.sidebar.checkbox[0].check()
+    page.sidebar.number_input[1].set_value(2.0)
+    page.sidebar.text_input[0].set_value(str(folder)).run()
 
 
 @pytest.fixture
@@ -62,9 +69,7 @@ def end_min(shown):
 
 
 def test_a_folder_of_one_cell_shows_its_numbers_its_life_and_the_end_of_a_discharge_in_progress(folder, page):
-    page.sidebar.checkbox[0].check()
-    page.sidebar.number_input[1].set_value(2.0)
-    page.sidebar.text_input[0].set_value(str(folder)).run()
+    show_one_cell(page, folder)
     says = calibrate(folder / "3.csv", nominal_Ah=2.0)[0]
     assert numbers(page) == {
         "q_max": f"{says.q_mobile_C / 3600.0:.3f} Ah",
@@ -90,9 +95,7 @@ def test_a_folder_of_one_cell_shows_its_numbers_its_life_and_the_end_of_a_discha
 
 def test_a_discharge_in_progress_has_the_one_health_of_its_life_and_its_own_in_small_print(folder, page):
     (folder / "3.csv").write_text(csv(LIFE[3].until(LIFE[3].time_s[0] + 1500.0)), encoding="utf-8")
-    page.sidebar.checkbox[0].check()
-    page.sidebar.number_input[1].set_value(2.0)
-    page.sidebar.text_input[0].set_value(str(folder)).run()
+    show_one_cell(page, folder)
     settings = Settings(nominal_Ah=2.0)
     running = read_discharges(folder / "3.csv")[0]
     end = forecast_end(running, settings, life=life_before(LIFE[:3], settings))
@@ -141,7 +144,7 @@ def test_without_a_settled_number_the_page_says_why(folder, page):
     assert np.isfinite([low, high]).all() and low > 20.0
 
 
-def test_files_are_dropped_and_nothing_is_stored(folder, page, tmp_path_factory, monkeypatch):
+def test_files_are_dropped_and_nothing_is_stored(page, tmp_path_factory, monkeypatch):
     kept = tmp_path_factory.mktemp("temporary")
     monkeypatch.setenv("TMPDIR", str(kept))
     monkeypatch.setattr("tempfile.tempdir", None)

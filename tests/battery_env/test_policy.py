@@ -39,7 +39,7 @@ def test_it_sees_what_the_sensors_show_and_nothing_more(data):
     assert scores["q_mobile_final"].tolist() == [NEW_CELL.q_mobile] * 5
 
 
-def test_bad_arguments_are_refused(data):
+def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match=r"decision_s must be a positive, finite number, got 0\.0"):
         PolicyEstimator(Always(0.0), "BatteryVoltageJoint-v0", decision_s=0.0)
     with pytest.raises(ValueError, match="CartPole-v1 is no calibration environment"):

@@ -2,6 +2,7 @@
 
 import hashlib
 import sys
+from dataclasses import replace
 from importlib.resources import files
 
 import numpy as np
@@ -9,7 +10,6 @@ import pytest
 
 from battery_env import (
     AgingPath,
-    Discharge,
     LeastSquares,
     OnnxPolicy,
     PolicyEstimator,
@@ -24,6 +24,7 @@ from battery_env.loads import Load
 from battery_env.policies.pretrained import file_stem, pretrained_card, pretrained_policy
 from battery_env.records.discharge import BUNDLED_CELLS
 from battery_env.tasks.data import standard_dataset
+from tests.records import recorded
 from tests.sweeps import sweep
 
 FOLDER = files("battery_env.policies.pretrained_policies")
@@ -86,7 +87,7 @@ class TestWhatIsNotThere:
         record = load_nasa_discharges("B0005")[30]
         first_s, last_s = record.time_s[record.current_A > 1.0][[0, -1]]
         kept = (record.time_s <= last_s - share * (last_s - first_s)) | (record.time_s >= last_s)
-        found = calibrate(Discharge(record.time_s[kept], record.voltage_V[kept], record.current_A[kept]), method="policy")
+        found = calibrate(recorded(record, kept), method="policy")
         off = abs(found.q_mobile_C / LeastSquares(mismatch_V=0.05).estimate(record.loaded_part(2.7)).q_mobile - 1.0)
         assert off < 0.02 or not found.settled_q_mobile
 
@@ -94,7 +95,7 @@ class TestWhatIsNotThere:
     def test_an_offset_of_the_current_is_in_the_standard_deviation(self, offset_A):
         record = load_nasa_discharges("B0006")[40]
         truth = calibrate(record, method="policy")
-        found = calibrate(Discharge(record.time_s, record.voltage_V, record.current_A + offset_A), method="policy")
+        found = calibrate(replace(record, current_A=record.current_A + offset_A), method="policy")
         assert abs(found.q_mobile_C - truth.q_mobile_C) < 3.0 * found.sd_q_mobile_C
 
     @pytest.mark.parametrize("load_A", sweep(2.0, 1.0, 4.0))
@@ -102,7 +103,7 @@ class TestWhatIsNotThere:
         _, options = pretrained_policy(ENV_ID, recorded=True)
         pulses = Load(np.arange(3000) * 10.0, np.tile([load_A, 0.0], 1500), "current")
         for cell in TrajectoryDataset.along(options["path"], 4, [pulses], seed=7):
-            found = calibrate(Discharge(cell.time_s, cell.voltage_V, cell.current_A, starts_at_rest=True), method="policy")
+            found = calibrate(recorded(cell, starts_at_rest=True), method="policy")
             assert abs(found.r_o_ohm / cell.r_o - 1.0) < 0.1 or not found.settled_r_o
 
 

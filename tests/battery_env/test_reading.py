@@ -52,13 +52,12 @@ def at(row, **values):
     return table
 
 
-def one_line(error):
-    return " ".join(str(error).split())
-
-
-def commands_of(error):
-    """The lines of an error that can be pasted."""
-    return [line.strip() for line in str(error).splitlines() if line.startswith("  ")]
+def refused(source, message):
+    """The error of what is not read."""
+    with pytest.raises(ValueError) as caught:
+        read_discharges(source)
+    assert re.search(message, " ".join(str(caught.value).split())), caught.value
+    return str(caught.value)
 
 
 CLOCK = {"Total Time (Hours in hh:mm:ss)": [*map(clock, RECORD.time_s)]}
@@ -256,15 +255,12 @@ def test_what_is_read_is_the_record_and_what_is_odd_is_said(table, said):
     near(read(table, said))
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize(("table", "message"), REFUSED.values(), ids=REFUSED)
 def test_what_is_refused_says_why(table, message):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pytest.raises(ValueError, match="") as caught:
-            read_discharges(table)
-    assert re.search(message, one_line(caught.value)), caught.value
-    for command_line in commands_of(caught.value):
-        assert eval(command_line, {"read_discharges": lambda _, **options: options, "table": table})  # can be pasted
+    for line in refused(table, message).splitlines():
+        if line.startswith("  "):  # can be pasted
+            assert eval(line.strip(), {"read_discharges": lambda _, **options: options, "table": table})
 
 
 TEXT = TABLE.to_csv(index=False)
@@ -326,14 +322,11 @@ def test_texts_are_read(text, said, tmp_path):
     near(read(tmp_path / "cell.csv", said))
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize(("text", "message"), NO_TEXTS.values(), ids=NO_TEXTS)
 def test_other_texts_are_refused_with_their_first_lines(text, message, tmp_path):
     (tmp_path / "cell.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pytest.raises(ValueError, match="") as caught:
-            read_discharges(tmp_path / "cell.csv")
-    assert re.search(message, one_line(caught.value)), caught.value
+    refused(tmp_path / "cell.csv", message)
 
 
 @pytest.mark.parametrize("with_step", [True, False])
@@ -383,7 +376,8 @@ def test_a_current_without_a_sign_is_refused_or_told_by_words(order):
     near(read(table.assign(Mode=table["Mode"].map(words))), 3e-3)
 
 
-@settings(max_examples=40, deadline=None)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@settings(max_examples=40)
 @given(st.integers(0, 4), st.integers(1, 40), st.booleans())
 def test_the_number_of_the_cycle_parts_no_rest_from_its_load_and_no_discharge(before, loops, with_charge):
     """``before``: so many rows of the rest count to the cycle of the load; in the load the counter goes up ``loops`` times."""
@@ -391,9 +385,7 @@ def test_the_number_of_the_cycle_parts_no_rest_from_its_load_and_no_discharge(be
     number = 7 + np.cumsum(np.isin(np.arange(len(CYCLE)), [rest - before, *np.linspace(rest, len(CYCLE), loops).astype(int)]))
     table = CYCLE.assign(Cycle=number)[0 if with_charge else len(CHARGE) :]
     table = pd.concat([table, table.assign(time=table["time"] + 9000.0, Cycle=table["Cycle"] + 100)])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        discharges = read_discharges(table)
+    discharges = read_discharges(table)
     assert [each.meta["cycle"] for each in discharges] == [number[rest], number[rest] + 100]
     for discharge in discharges:
         near(discharge, 3e-3)
@@ -492,14 +484,14 @@ def test_the_charge_of_a_cell_of_any_size_is_known_and_where_that_is_another_its
     assert "nan" not in str(found)
 
 
-def small_cell(highest_V=4.3, lowest_V=3.0, mAh=1.27, rows=95, hours=34.0):
-    """A half cell of so little charge, slowly discharged after a rest of two rows."""
-    time_h = np.linspace(0.0, hours, rows)
-    fall_V = (highest_V - lowest_V) * (np.arange(rows) / rows) ** 2
-    current_A = np.where(np.arange(rows) < 2, 0.0, 1e-3 * mAh / hours)
-    return pd.DataFrame({"time (h)": time_h, "voltage (V)": highest_V - fall_V, "current (A)": -current_A})
+def small_cell(highest_V=4.3, lowest_V=3.0):
+    """A half cell of 1.27 mAh, discharged in 34 hours after a rest of two rows."""
+    row = np.arange(95)
+    voltage_V, current_A = highest_V - (highest_V - lowest_V) * (row / 95) ** 2, np.where(row < 2, 0.0, 1.27e-3 / 34.0)
+    return pd.DataFrame({"time (h)": np.linspace(0.0, 34.0, 95), "voltage (V)": voltage_V, "current (A)": -current_A})
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("ends", ["whole", "above the cut-off"])
 def test_nothing_is_searched_for_what_is_far_below_the_sizes_of_the_model(ends, monkeypatch):
     def search(*given, **options):
@@ -507,14 +499,12 @@ def test_nothing_is_searched_for_what_is_far_below_the_sizes_of_the_model(ends, 
 
     monkeypatch.setattr(LeastSquares, "estimate", search)
     monkeypatch.setattr(calibrate_module, "forecast", search)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        (found,) = calibrate(small_cell(lowest_V=2.6 if ends == "whole" else 3.0))
-        assert found.drawn_Ah == pytest.approx(1.27e-3, rel=0.05) and found.reason.startswith("Cells below 28 mAh are not")
-        assert found.capacity_Ah == pytest.approx(found.drawn_Ah) if ends == "whole" else np.isnan(found.capacity_Ah)
-        (record,) = read_discharges(small_cell())
-        with pytest.raises(ValueError, match="Cells below 28 mAh are not modelled"):
-            running_module.forecast_end(record)
+    (found,) = calibrate(small_cell(lowest_V=2.6 if ends == "whole" else 3.0))
+    assert found.drawn_Ah == pytest.approx(1.27e-3, rel=0.05) and found.reason.startswith("Cells below 28 mAh are not")
+    assert found.capacity_Ah == pytest.approx(found.drawn_Ah) if ends == "whole" else np.isnan(found.capacity_Ah)
+    (record,) = read_discharges(small_cell())
+    with pytest.raises(ValueError, match="Cells below 28 mAh are not modelled"):
+        running_module.forecast_end(record)
 
 
 @pytest.mark.parametrize("lowest_V", [0.02, 0.8, 1.5])
@@ -595,16 +585,13 @@ def test_a_folder_reads_numbered_text_and_names_what_it_left_out(tmp_path, capsy
     assert [source.stem for source in find_sources([str(lab / "cell.001")])] == ["cell"]
 
 
-def test_a_refused_file_shows_the_command_that_reads_it(tmp_path, capsys):
+def test_a_refused_file_shows_the_command_that_reads_it(tmp_path):
     path = tmp_path / "cell.csv"
     table = pd.DataFrame({"time_s": RECORD.time_s, "batt_mV": 1e3 * RECORD.voltage_V, "load_mA": 1e3 * RECORD.current_A})
     table.to_csv(path, index=False)
     said = "row 1 0.0, 418.*row 2 9.*time 'time_s' in s.*places: "
     said += rf"battery-calibrate {path} --columns voltage=batt_mV,current=load_mA"
-    with pytest.raises(ValueError, match="") as caught:
-        read_discharges(path)
-    assert re.search(said, one_line(caught.value))
-    stated = re.search(r"--columns (\S+)", str(caught.value))[1]
+    stated = re.search(r"--columns (\S+)", refused(path, said))[1]
     assert command([str(path), "--columns", stated]) == 0
     assert command([str(path), "--columns", stated, "--ignore", "batt_mV"]) == 2
 

@@ -7,15 +7,11 @@ import pytest
 
 from battery_env import Discharge, calibrate, load_nasa_discharges, simulate
 from battery_env.estimators.resistance import later_step, load_on, measured_resistance_ohm
+from tests.records import recorded
 from tests.sweeps import sweep
 
 SIMULATED = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True, cut_off_V=2.69)
 FALL_OHM = float(SIMULATED.voltage_V[0] - SIMULATED.voltage_V[10]) / 2.0
-
-
-def recorded(trajectory, starts_at_rest=True, current_A=None):
-    current_A = trajectory.current_A if current_A is None else current_A
-    return Discharge(trajectory.time_s, trajectory.voltage_V, current_A, starts_at_rest=starts_at_rest)
 
 
 def late(time_s, values, constant_s):
@@ -27,7 +23,7 @@ def late(time_s, values, constant_s):
 
 
 def test_it_is_the_fall_from_rest_to_ten_seconds_over_the_current():
-    found = calibrate(recorded(SIMULATED))
+    found = calibrate(recorded(SIMULATED, starts_at_rest=True))
     assert found.settled and found.resistance_10s_ohm == pytest.approx(FALL_OHM, rel=0.01)
     assert found.measured_resistance_10s_ohm == pytest.approx(FALL_OHM, rel=1e-3)
     assert found.sd_resistance_10s_ohm < 0.1 * FALL_OHM
@@ -35,20 +31,18 @@ def test_it_is_the_fall_from_rest_to_ten_seconds_over_the_current():
 
 
 def test_without_a_rest_it_is_blank_and_that_of_the_model_counts():
-    found = calibrate(recorded(SIMULATED, starts_at_rest=False))
+    found = calibrate(recorded(SIMULATED))
     assert np.isnan([found.resistance_10s_ohm, found.measured_resistance_10s_ohm]).all()
     assert found.settled and found.settled_r_o and not found.settled_resistance_10s
     assert "10 s resistance" not in str(found)
 
 
 def test_rows_that_lie_far_apart_show_no_measured_resistance():
-    record = recorded(SIMULATED)
     for every_s, is_shown in ((2, True), (30, False)):
-        rows = Discharge(
-            record.time_s[::every_s], record.voltage_V[::every_s], record.current_A[::every_s], starts_at_rest=True
-        )
+        rows = recorded(SIMULATED, slice(None, None, every_s), starts_at_rest=True)
         assert np.isfinite(measured_resistance_ohm(rows, True)) == is_shown
-    assert not load_on(recorded(simulate(np.tile([2.0] * 5 + [0.0] * 25, 40), 6000.0, 0.15, load_unit="current")), True).stays
+    pulses = simulate(np.tile([2.0] * 5 + [0.0] * 25, 40), 6000.0, 0.15, load_unit="current")
+    assert not load_on(recorded(pulses, starts_at_rest=True), True).stays
 
 
 @pytest.mark.parametrize("number", sweep(49, 1, 121))
@@ -78,8 +72,8 @@ def test_without_a_rest_a_later_switch_is_compared_whatever_its_moment():
 
 
 def test_what_is_measured_after_another_switch_is_no_resistance_of_the_first():
-    record = recorded(simulate(np.repeat([1.0, 2.5, 0.8, 2.0] * 60, 60), 6000.0, 0.15, load_unit="current", cut_off_V=2.69))
-    rows = Discharge(record.time_s[::5], record.voltage_V[::5], record.current_A[::5])
+    record = simulate(np.repeat([1.0, 2.5, 0.8, 2.0] * 60, 60), 6000.0, 0.15, load_unit="current", cut_off_V=2.69)
+    rows = recorded(record, slice(None, None, 5))
     step = later_step(rows)
     assert step.is_measured(rows, 10.0) and not step.is_measured(rows, 60.0)
     assert "resistance_differs" not in [each.code for each in calibrate(rows).findings]

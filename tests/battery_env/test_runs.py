@@ -24,7 +24,7 @@ from battery_env.lab import batch, command_line
 from battery_env.lab.batch import attempt, workers
 from battery_env.lab.command_line import calibrate as command
 from battery_env.lab.sources import find_sources
-from tests.faults import a_full_disk, squared_after_a_while, squared_unless_it_ends_its_process
+from tests.faults import a_full_disk, squared_after_a_while, squared_unless_it_ends_its_process, until
 from tests.sweeps import sweep
 from tests.terminal import write
 
@@ -44,13 +44,6 @@ def lab(tmp_path_factory):
 def started(*arguments, **more):
     command = [sys.executable, "-m", "battery_env", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **more)
-
-
-def wait_for(condition):
-    end = time.monotonic() + 300.0
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def rows_in(out):
@@ -87,12 +80,12 @@ def undisturbed(lab, tmp_path_factory):
 def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed, tmp_path, capsys):
     arguments = (lab, "--out", tmp_path, "--table-only", "--jobs", 2)
     process = started(*arguments)
-    wait_for(lambda: rows_in(tmp_path) >= 3)
+    until(lambda: rows_in(tmp_path) >= 3, 300.0)
     others = workers_of(process.pid)
     assert len(others) == 2
     os.kill(others[0] if end == "worker" else process.pid, signal.SIGKILL if end == "worker" else end)
     _, error = process.communicate(timeout=300)
-    wait_for(lambda: not any(map(is_alive, others)))
+    until(lambda: not any(map(is_alive, others)), 300.0)
     if end == "worker":  # one takes its place
         assert process.returncode == 0, error
     else:
@@ -108,20 +101,14 @@ def test_the_same_command_goes_on_and_nothing_outlives_it(end, lab, undisturbed,
     assert (tmp_path / "estimate.csv").read_bytes() == undisturbed
 
 
-def test_a_call_that_its_process_does_not_survive_is_an_error_and_all_others_are_made():
-    with workers(2) as pool:
-        made = [pool.submit(squared_unless_it_ends_its_process, n, (1,)) for n in range(5)]
-        assert [isinstance(each.exception(), BrokenExecutor) for each in made] == [n == 1 for n in range(5)]
-        assert [each.result() for n, each in enumerate(made) if n != 1] == [0, 4, 9, 16]
-
-
-def test_a_lost_process_takes_no_other_call_with_it(tmp_path):
+def test_a_call_that_its_process_does_not_survive_is_an_error_and_takes_no_other_call_with_it(tmp_path):
     log = tmp_path / "begun"
     with workers(2) as pool:
         slow = pool.submit(squared_after_a_while, 3, log)
-        wait_for(log.exists)
-        lost = pool.submit(squared_unless_it_ends_its_process, 1, (1,))
-        assert isinstance(lost.exception(), BrokenExecutor)
+        until(log.exists, 300.0)
+        made = [pool.submit(squared_unless_it_ends_its_process, n, (1,)) for n in range(5)]
+        assert [isinstance(each.exception(), BrokenExecutor) for each in made] == [n == 1 for n in range(5)]
+        assert [each.result() for n, each in enumerate(made) if n != 1] == [0, 4, 9, 16]
         assert slow.result() == 9 and log.read_bytes() == b"x"
 
 

@@ -16,11 +16,12 @@ from battery_env import (
     track_life,
 )
 from battery_env.estimates.findings import CODES, Doubt, Finding, Reason, findings_of, is_only_imprecise
-from battery_env.estimators import CellFit, Estimate, LeastSquares, fit_cell
+from battery_env.estimators import Estimate, LeastSquares
 from battery_env.estimators.verdict import Assumptions, Diagnosis
 from battery_env.lab.running import calibrate_running
 from battery_env.lab.settings import Settings
 from battery_env.records import DischargeStart, expected_current
+from tests.records import recorded
 from tests.sweeps import sweep
 
 SECONDS = np.arange(60_000)
@@ -32,8 +33,7 @@ def calibrator(**more) -> LeastSquares:
 
 def discharged(current_A=2.0, q_mobile=6000.0, r_o=0.15, noise_V=0.005, **more) -> Discharge:
     record = simulate(current_A, q_mobile, r_o, load_unit="current", thermal=True, cut_off_V=2.8, **more)
-    voltage_V = record.voltage_V + np.random.default_rng(0).normal(0.0, noise_V, len(record.voltage_V))
-    return Discharge(record.time_s, voltage_V, record.current_A, starts_at_rest=True)
+    return recorded(record, noise_V=noise_V, starts_at_rest=True)
 
 
 def changed(record: Discharge, kept=slice(None), late_s=0.0, rested=True) -> Discharge:
@@ -54,13 +54,6 @@ def stuck(record: Discharge, from_s: float, until_s: float) -> Discharge:
     """Its voltage sensor fails for a while."""
     failed = (record.time_s >= from_s) & (record.time_s < until_s)
     return replace(record, voltage_V=np.where(failed, record.voltage_V[failed.argmax()], record.voltage_V))
-
-
-def lost_now_and_then(record: Discharge, for_s: float) -> Discharge:
-    """Its current is not logged for a while, five times."""
-    return replace(
-        record, current_A=np.where((record.time_s % 500 >= 400) & (record.time_s % 500 < 400 + for_s), 0.0, record.current_A)
-    )
 
 
 def logged_by_voltage(load_A) -> Discharge:
@@ -85,9 +78,6 @@ REAL = load_nasa_discharges("B0005")[60]
 LOW = replace(REAL, voltage_V=REAL.voltage_V - 0.2)
 STUCK = stuck(discharged(np.where(SECONDS < 100, 0.0, pulsed(100, 200, 1.0, 3.0))), 1190.0, 1270.0)
 RISING = discharged(pulsed(200, 400, 2.0, 0.2))
-AFTER_REST = discharged(np.append(np.zeros(60), np.full(20_000, 2.0)))
-AGAIN = changed(AFTER_REST, late_s=AFTER_REST.time_s[-1] + 1.0)
-TWICE = Discharge(*(np.append(getattr(AFTER_REST, c), getattr(AGAIN, c)) for c in ("time_s", "voltage_V", "current_A")))
 MISFIT = Reason.MISFIT.text
 
 #: Each reason of the tables of conditions: of which record, with which arguments of the calibrator.
@@ -245,17 +235,12 @@ def test_a_finding_keeps_what_its_text_names_and_says_it(row):
             str(replace(found, measured={each: value for each, value in found.measured.items() if each != name}))
 
 
-def scaled(record: Discharge, by: float) -> Discharge:
-    """Its current is read with a gain."""
-    return Discharge(record.time_s, record.voltage_V, by * record.current_A, record.temperature_C)
-
-
 @pytest.mark.parametrize("number", [9, 84, 167])
 def test_a_nominal_capacity_and_a_life_contradict_a_cell_of_another_size(number):
     *before, whole = load_nasa_discharges("B0005")[number - 3 : number + 1]
     life = track_life(before, 2.7)
     for gain in (0.25, 3.0, 4.0):
-        record = scaled(whole, gain)
+        record = replace(whole, current_A=gain * whole.current_A)
         for found in (calibrate(record, nominal_Ah=2.0), calibrate_running(record, Settings(), life=life)):
             (each,) = (each for each in found.findings if each.code == "prior_wrong")
             assert not (found.settled or found.settled_q_mobile or found.settled_resistance_10s or found.settled_r_o)
@@ -390,11 +375,6 @@ class TestGaps:
     def test_a_charge_in_doubt_widens_the_estimate_by_as_much(self):
         estimate = calibrator().estimate(VERDICTS["noise hides whether it was drawn"][0])
         assert 2.0 * 80.0 < estimate.sd_q_mobile < 2.0 * 80.0 + 100.0
-
-
-@pytest.fixture(scope="module")
-def young_fit() -> CellFit:
-    return fit_cell([load_nasa_discharges("B0005")[n] for n in (0, 10, 20)], cut_off_V=2.7)
 
 
 class TestPrecision:

@@ -1,24 +1,15 @@
 """Streams of policies: sample by sample, with gaps and rests, stopped and resumed."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from battery_env import PolicyEstimator, simulate
+from battery_env import PolicyEstimator, SensorErrors, simulate
 from tests.policies import Always
 
-NOISE_V = 0.005
 
-
-def measured(load_A=2.0, q_mobile=6000.0, r_o=0.15, thermal=True, seed=0, noise_V=NOISE_V, **more):
-    record = simulate(load_A, q_mobile, r_o, load_unit="current", thermal=thermal, **more)
-    return replace(record, voltage_V=record.voltage_V + np.random.default_rng(seed).normal(0.0, noise_V, len(record.time_s)))
-
-
-def follow(estimator, record, dt_s=1.0, temperature_C=None):
+def follow(estimator, record):
     for voltage_V, current_A in zip(record.voltage_V.tolist(), record.current_A.tolist(), strict=True):
-        estimate = estimator.update(voltage_V, current_A, dt_s, temperature_C)
+        estimate = estimator.update(voltage_V, current_A, 1.0)
     return estimate
 
 
@@ -28,7 +19,8 @@ def policy_estimator(**more):
 
 @pytest.fixture(scope="module")
 def whole():
-    return measured()
+    record = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True)
+    return SensorErrors(0.005).apply(record, np.random.default_rng(0))
 
 
 class TestSamples:

@@ -11,10 +11,9 @@ from battery_env.tasks.registration import TASKS
 from battery_env.trajectories import TrajectoryDataset
 
 IDS = ("BatteryQmax-v0", "BatteryRo-v0", "BatteryJoint-v0", "BatteryQmaxPaper-v0", "BatteryRoPaper-v0")
-#: All environments, with short episodes.
-CASES = [(env_id, {"episode_steps": 4}) for env_id in TASKS]
 # whatever draws at random
 NOISY = {"initial_perturbation": 3.0, "continue_probability": 0.5, "first_sample_probability": 0.3}
+OPTIONS = [("BatteryVoltageJoint-v0", {"nuisance": 0.2}), *((env_id, NOISY) for env_id in IDS)]
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +47,9 @@ def assert_same_infos(found, expected, mask=None):
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize(("env_id", "options"), [*CASES, *((env_id, {"episode_steps": 4} | NOISY) for env_id in IDS)])
+@pytest.mark.parametrize(("env_id", "options"), [*((env_id, {}) for env_id in TASKS), *OPTIONS])
 def test_a_batch_makes_the_episodes_of_scalar_environments_to_the_bit(env_id, options, mode, discharges):
-    batch, sync = make_pair(env_id, mode, dataset=discharges, **options)
+    batch, sync = make_pair(env_id, mode, dataset=discharges, episode_steps=4, **options)
     assert (batch.observation_space, batch.action_space) == (sync.observation_space, sync.action_space)
     assert batch.metadata["autoreset_mode"] is mode and batch.metadata["discount"] == 0.8
     sync.action_space.seed(0)

@@ -2,16 +2,15 @@
 
 import os
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
-from battery_env import NEW_CELL, Discharge, RandomSensorErrors, TrajectoryDataset, load_nasa_discharges
+from battery_env import NEW_CELL, RandomSensorErrors, TrajectoryDataset, load_nasa_discharges
 from battery_env.loads import RandomPiecewise
 from battery_env.tasks.env import CalibrationEnv
 from battery_env.tasks.full_state.full_state_task import BatteryQmax
 from battery_env.tasks.voltage.voltage_task import ESTIMATE_RANGES, LARGEST_STEPS, VoltageTask
+from tests.records import recorded
 
 BOTH = ("q_mobile", "r_o")
 LOW, HIGH = np.array([ESTIMATE_RANGES[name] for name in BOTH]).T
@@ -78,8 +77,7 @@ class TestTask:
 
     def test_the_observation_knows_no_truth(self, data):
         """The same discharges without their true parameters look the same."""
-        unknown = [Discharge(record.time_s, record.voltage_V, record.current_A) for record in data]
-        one, other = started(data), started(unknown)
+        one, other = started(data), started([recorded(each) for each in data])
         for _ in range(3):
             np.testing.assert_array_equal(one.observation(), other.observation())
             np.testing.assert_array_equal(one.advance(np.full((4, 2), 0.1)), other.advance(np.full((4, 2), 0.1)))
@@ -132,11 +130,11 @@ class TestTask:
             np.testing.assert_array_equal(task.observation(), by_misfit.observation())
 
     def test_a_recording_does_not_know_its_state(self, data):
-        recorded = [discharge.loaded_part(3.0) for discharge in load_nasa_discharges("B0005")[:2]]
+        of_cells = [discharge.loaded_part(3.0) for discharge in load_nasa_discharges("B0005")[:2]]
         with pytest.raises(ValueError, match="and 2 of 10 discharges are not simulated: take cost='misfit'"):
-            VoltageTask(1, dataset=[*data, *recorded], cost="state")
+            VoltageTask(1, dataset=[*data, *of_cells], cost="state")
         # a policy that was trained with it can be asked about one
-        task = VoltageTask.of_records(recorded, 30, cost="state")
+        task = VoltageTask.of_records(of_cells, 30, cost="state")
         assert np.isfinite(task.advance(np.zeros((2, 2)))).all()
 
     @pytest.mark.parametrize(
@@ -165,11 +163,6 @@ class TestTask:
 
 
 class TestEnvironments:
-    def test_gymnasium_checks_pass(self, data):
-        env = gym.make("BatteryVoltageJoint-v0", dataset=data).unwrapped
-        assert env.action_space.shape == (2,) and env.task.parameters == BOTH
-        check_env(env, skip_render_check=True)
-
     @pytest.mark.parametrize(("name", "value"), [("q_mobile", 5000.0), ("r_o", 0.2)])
     def test_reset_options(self, name, value, data):
         env = CalibrationEnv(VoltageTask, dataset=data)
@@ -197,9 +190,7 @@ class TestOwnCell:
 
     def test_its_constants_are_those_of_its_data_or_those_that_are_given(self, own, data):
         assert started(own).readings.cell == self.CELL
-        as_recorded = [
-            Discharge(trajectory.time_s, trajectory.voltage_V, trajectory.current_A, starts_at_rest=True) for trajectory in own
-        ]
+        as_recorded = [recorded(each, starts_at_rest=True) for each in own]
         for discharges, cell in ((as_recorded, self.CELL), (as_recorded, None), (own, NEW_CELL), (data, None)):
             task = started(discharges, start="new_cell", cell=cell, **EXACT)
             model = NEW_CELL if cell is None else cell
@@ -207,7 +198,7 @@ class TestOwnCell:
             np.testing.assert_array_equal(task.estimate, [[model.q_mobile, model.r_o]] * 4)
 
     def test_with_them_the_truth_explains_a_recording_and_with_others_it_does_not(self, own):
-        as_recorded = [Discharge(trajectory.time_s, trajectory.voltage_V, trajectory.current_A) for trajectory in own]
+        as_recorded = [recorded(each) for each in own]
         for cell, explained in ((self.CELL, True), (None, False)):
             task = VoltageTask(1, dataset=as_recorded, cell=cell, **EXACT)
             for discharge, trajectory in enumerate(own):

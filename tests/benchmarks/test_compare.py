@@ -307,7 +307,7 @@ def test_nonsense_on_the_command_line_is_refused_before_any_training(wrong, mess
     assert finished == []
 
 
-def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatch, capsys):
+def test_one_that_fails_costs_the_others_no_table(tmp_path, finished, monkeypatch):
     finish = compare.part
 
     def part(algo, source, run, out, evaluations):

@@ -37,7 +37,7 @@ def test_published_intervals_of_nine_of_ten_hold_where_life_and_load_are_known()
 
 
 @pytest.mark.attacks
-def test_the_life_that_remains_is_compared_with_the_measured_one(tmp_path):
+def test_the_life_that_remains_is_compared_with_the_measured_one():
     published = pd.read_csv(table_file(Path("docs/results/real_cells"), "discharges"))
     # the second half of its life
     table = published[published["cell"] == "B0005"][84:].reset_index(drop=True).assign(reason="", valid=True, lasted_share=1.0)

@@ -4,9 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from battery_env import NEW_CELL, Discharge, simulate
+from battery_env import NEW_CELL, simulate
 from benchmarks import pybamm_cells
 from benchmarks.pybamm_cells import FIT, LIFE, SHARES, SimulatedLife, varies
+from tests.records import recorded
 
 
 def life(name, seed, numbers=range(12), surroundings_C=25.0):
@@ -14,7 +15,7 @@ def life(name, seed, numbers=range(12), surroundings_C=25.0):
     for n in numbers:
         load = 2.0 if not varies(n) else np.repeat(rng.uniform(0.7, 3.0, 300), 60)
         made.append(simulate(load, 7000.0 - 60.0 * n, 0.1 + 0.003 * n, load_unit="current", cell=NEW_CELL.replace(VEOD=2.4)))
-    return SimulatedLife([Discharge(each.time_s[::5], each.voltage_V[::5], each.current_A[::5]) for each in made], 2.7)
+    return SimulatedLife([recorded(each, slice(None, None, 5)) for each in made], 2.7)
 
 
 @pytest.mark.attacks

@@ -103,7 +103,7 @@ def test_a_training_that_another_command_is_at_is_left_to_it(trainer):
     assert rows_of(trainer).empty
 
 
-def test_what_is_compiled_and_how_large_the_buffer_is_is_no_part_of_a_run(monkeypatch):
+def test_what_is_compiled_and_how_large_the_buffer_is_is_no_part_of_a_run():
     env = RUN.environments()
     model = RUN.model(env, compiled=True)
     assert model.compile_update and model.replay_buffer.buffer_size == 60 and RUN.key == replace(RUN).key

@@ -50,6 +50,12 @@ def optimal(linear_env):
 
 
 @pytest.fixture(scope="module")
+def judged(optimal, linear_env):
+    controller, lyapunov = optimal
+    return evaluate_lyapunov(controller, linear_env, n_episodes=50, seed=100, lyapunov=lyapunov)
+
+
+@pytest.fixture(scope="module")
 def exact():
     """The function of the optimal loop whose decrease is all of the cost, its matrix and the average cost."""
     env = LinearCostEnv()
@@ -61,10 +67,8 @@ def exact():
 # Good and bad loops
 
 
-def test_function_of_the_optimal_loop_is_the_exact_one(optimal, linear_env, exact):
-    controller, lyapunov = optimal
-    function, _, average_cost = exact
-    report = evaluate_lyapunov(controller, linear_env, n_episodes=50, seed=100, lyapunov=lyapunov)
+def test_function_of_the_optimal_loop_is_the_exact_one(optimal, judged, linear_env, exact):
+    (controller, lyapunov), (function, _, average_cost), report = optimal, exact, judged
     values, learned = function.values(report.observations), report.transitions["lyapunov"].to_numpy()
     assert np.corrcoef(values, learned)[0, 1] > 0.998
     assert np.polyfit(values, learned, 1)[0] == pytest.approx(1.0, abs=0.05)
@@ -184,21 +188,17 @@ NONE = Interval(math.nan, math.nan, math.nan)
         ({"largest_feasible_alpha3": TOO_WIDE, "cost_bound": Interval(20.0, 19.0, 21.0)}, Reason.UNSETTLED, None),
     ],
 )
-def test_each_reason_is_said_with_the_episodes_that_it_lacks(optimal, linear_env, changed, reason, enough):
-    controller, lyapunov = optimal
-    report = evaluate_lyapunov(controller, linear_env, n_episodes=50, seed=100, lyapunov=lyapunov)
-    report = dataclasses.replace(report, metrics=report.metrics | changed)
+def test_each_reason_is_said_with_the_episodes_that_it_lacks(judged, changed, reason, enough):
+    report = dataclasses.replace(judged, metrics=judged.metrics | changed)
     first = report.summary().splitlines()[0]
     assert not report.holds and first.startswith("NOT SHOWN") and reason.value in first
     assert re.findall(r"50 do not tell, n_episodes=(\d+) may", first) == ([] if enough is None else [str(enough)])
     assert (SHORT in first) == (enough is not None)
 
 
-def test_verdict_that_holds_says_if_more_episodes_may_show_a_rise(optimal, linear_env):
-    controller, lyapunov = optimal
-    report = evaluate_lyapunov(controller, linear_env, n_episodes=50, seed=100, lyapunov=lyapunov)
-    assert SHORT not in report.summary()
-    report = dataclasses.replace(report, metrics=report.metrics | {"late_rise": Interval(1.0, -0.5, 2.5)})
+def test_verdict_that_holds_says_if_more_episodes_may_show_a_rise(judged):
+    assert SHORT not in judged.summary()
+    report = dataclasses.replace(judged, metrics=judged.metrics | {"late_rise": Interval(1.0, -0.5, 2.5)})
     assert report.holds and f"{SHORT}: whether {Reason.COST_RISES.value}, n_episodes=150 may tell" in report.summary()
 
 

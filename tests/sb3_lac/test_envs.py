@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,12 +32,11 @@ CLASSES = [CartPoleCostEnv, LinearCostEnv, OscillatorEnv, PendulumCostEnv, Quadr
 GAMMA = 0.95
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("env_id", IDS)
 def test_both_checkers_find_nothing(env_id):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(gym.make(env_id, render_mode="rgb_array"))
-        check_gymnasium_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
+    check_env(gym.make(env_id, render_mode="rgb_array"))
+    check_gymnasium_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
 
 
 class Undrawn(OscillatorEnv):
@@ -409,14 +407,13 @@ class TestDomainRandomization:
         np.testing.assert_array_equal(*starts)
         assert (steps[0] != steps[1]).any()
 
+    @pytest.mark.filterwarnings("ignore:.*different from the unwrapped version.*")
     def test_both_checkers_find_nothing_and_its_spec_makes_it_again(self):
         env = DomainRandomization(gym.make("Pendulum-v1"), {"l": (0.8, 1.2)})
         check_env(env)
         again = gym.make(env.spec)
         assert again.reset(seed=3)[1] == env.reset(seed=3)[1]
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*different from the unwrapped version.*")
-            check_gymnasium_env(env, skip_render_check=True)
+        check_gymnasium_env(env, skip_render_check=True)
 
     @pytest.mark.parametrize(
         ("drawn", "message"),

@@ -107,13 +107,13 @@ ADDITIONS = {
 
 
 @pytest.mark.parametrize("named", sweep(*ADDITIONS))
-def test_what_a_graph_would_leave_out_acts_as_without_compilation_from_the_call_on_in_which_it_is_there(make_encoded, named):
+def test_what_a_graph_would_leave_out_acts_as_without_compilation_from_the_call_on_in_which_it_is_there(
+    make_encoded, train_metrics, named
+):
     results = []
     for compile_update in (False, True):
         model = make_encoded(compile_update=compile_update)
-        th.manual_seed(0)
-        np.random.seed(0)
-        model.train(1, 16)
+        train_metrics(model)
         handle = ADDITIONS[named](model)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -139,30 +139,28 @@ def test_an_update_is_compiled_again_when_the_hook_has_gone(make_encoded, capsys
 
 
 @pytest.mark.attacks
-def test_momentum_is_compiled_from_its_second_step_on(make_model, monkeypatch):
+def test_momentum_is_compiled_from_its_second_step_on(make_model, train_metrics, monkeypatch):
     monkeypatch.setattr(compiled, "BACKEND", "eager")
     momentum = {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.9}, "net_arch": [8]}
     models = [make_model(policy_kwargs=momentum, compile_update=compile_update) for compile_update in (False, True)]
     for model in models:
-        th.manual_seed(0)
-        np.random.seed(0)
-        model.train(4, 16)
+        train_metrics(model, gradient_steps=4)
     th.testing.assert_close(*(list(model.policy.parameters()) for model in models), rtol=1e-4, atol=1e-6)
     th.compiler.reset()
 
 
 @pytest.mark.parametrize("algorithm", [LAC, PublishedLAC])
 @pytest.mark.parametrize("name", ["critic", "actor"])
-def test_an_encoder_with_an_optimizer_of_its_own_gets_the_gradient_of_its_networks_loss_alone(make_encoded, algorithm, name):
+def test_an_encoder_with_an_optimizer_of_its_own_gets_the_gradient_of_its_networks_loss_alone(
+    make_encoded, train_metrics, algorithm, name
+):
     gradients = []
     for is_taken_out in (False, True):
         model = make_encoded(algorithm=algorithm)
         network = getattr(model, name)
         encoder = taken_out(network) if is_taken_out else network.features_extractor
         encoder.zero_grad()
-        np.random.seed(0)
-        th.manual_seed(0)
-        model.train(1, 16)
+        train_metrics(model)
         gradients.append([parameter.grad.clone() for parameter in encoder.parameters()])
     assert all(gradient.abs().max() > 0 for gradient in gradients[0])
     th.testing.assert_close(*gradients, rtol=0, atol=0)
@@ -171,7 +169,7 @@ def test_an_encoder_with_an_optimizer_of_its_own_gets_the_gradient_of_its_networ
     assert not th.equal(encoder.layer.weight.grad, gradients[1][0])
 
 
-def test_an_encoder_of_both_that_the_critic_trains_gets_nothing_of_the_actors_loss(make_encoded):
+def test_an_encoder_of_both_that_the_critic_trains_gets_nothing_of_the_actors_loss(make_encoded, train_metrics):
     gradients = []
     for is_shared in (False, True):
         model = make_encoded(ent_coef=0.0)
@@ -182,9 +180,7 @@ def test_an_encoder_of_both_that_the_critic_trains_gets_nothing_of_the_actors_lo
         else:
             model.actor.features_extractor.load_state_dict(model.critic.features_extractor.state_dict())
         assert len(model.actor.optimizer.param_groups[0]["params"]) == len(held) - 2 * is_shared
-        np.random.seed(0)
-        th.manual_seed(0)
-        model.train(1, 16)
+        train_metrics(model)
         gradients.append(model.critic.features_extractor.layer.weight.grad.clone())
     th.testing.assert_close(*gradients, rtol=0, atol=0)
 

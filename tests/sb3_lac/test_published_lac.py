@@ -1,7 +1,6 @@
 """The published algorithm: one update, written out a second time from the equations, and the sums of its finite horizon."""
 
 import math
-import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -181,7 +180,7 @@ def test_bad_arguments_are_named(make_model, kwargs, message):
         make_model(algorithm=PublishedLAC, n_collect=0, **kwargs)
 
 
-def test_horizon_needs_a_buffer_of_its_own(make_model, make_env):
+def test_horizon_needs_a_buffer_of_its_own(make_model):
     with pytest.raises(NotImplementedError, match="doesn't support optimize_memory_usage"):
         kwargs = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
         make_model(algorithm=PublishedLAC, n_collect=0, horizon=3, **kwargs)
@@ -209,10 +208,9 @@ def test_horizon_is_that_of_the_model_with_a_buffer_of_another_one(make_model, t
     assert other.replay_buffer.horizon == 7
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_horizon_is_a_finite_sum_without_a_discount(make_model, make_env):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        model = make_model(make_env(offset=4.0), algorithm=PublishedLAC, horizon=3, gamma=1.0, reward_bound=5.0)
+    model = make_model(make_env(offset=4.0), algorithm=PublishedLAC, horizon=3, gamma=1.0, reward_bound=5.0)
     assert model.critic.offset.item() == 3 * 5.0
 
 

@@ -1,7 +1,6 @@
 """Mistakes that implementations of LAC are known for: a regression test for each."""
 
 import math
-import warnings
 
 import numpy as np
 import pytest
@@ -29,11 +28,10 @@ def test_lambda_does_not_wind_up(make_model, train_metrics):
     assert math.exp(model.log_lambda.item()) == pytest.approx(0.5)
 
 
+@pytest.mark.filterwarnings("error")
 def test_default_arguments_do_not_warn(make_env):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        model = LAC("MlpPolicy", make_env(), verbose=1, learning_starts=5, batch_size=4, buffer_size=10, device="cpu")
-        model.learn(10, log_interval=None)
+    model = LAC("MlpPolicy", make_env(), verbose=1, learning_starts=5, batch_size=4, buffer_size=10, device="cpu")
+    model.learn(10, log_interval=None)
 
 
 def near_a_half(actions, rng):
@@ -140,13 +138,6 @@ def test_everything_that_is_learned_is_saved(make_model, train_metrics):
     # Some wait for positive rewards, and a root stays
     waiting = {"critic.offset", "critic_target.offset", "reward_bound"}
     assert unchanged == waiting | {"critic.root_degree", "critic_target.root_degree"}
-
-
-def test_entropy_coefficient_and_target_can_be_written_as_text(make_model):
-    model = make_model(n_collect=0, ent_coef="0.2", target_entropy="-1.5")
-    assert model.log_ent_coef is None
-    assert model.ent_coef_tensor.item() == pytest.approx(0.2)
-    assert model.target_entropy == -1.5
 
 
 @pytest.mark.parametrize(

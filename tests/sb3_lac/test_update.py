@@ -225,8 +225,10 @@ def test_a_rate_that_is_changed_is_the_rate_of_all_that_the_argument_says(
     assert tuple(optimizer.param_groups[0]["lr"] for optimizer in optimizers) == expected
 
 
-def test_fixed_entropy_coefficient_stays(make_model, train_metrics):
-    model = make_model(ent_coef=0.2)
+@pytest.mark.parametrize("ent_coef", [0.2, "0.2"])
+def test_fixed_entropy_coefficient_stays_and_it_and_the_target_may_be_texts(make_model, train_metrics, ent_coef):
+    model = make_model(ent_coef=ent_coef, target_entropy="-1.5")
+    assert model.log_ent_coef is None and model.target_entropy == -1.5
     metrics = train_metrics(model, gradient_steps=3)
     assert metrics["ent_coef"] == pytest.approx(0.2)
     assert "ent_coef_loss" not in metrics
