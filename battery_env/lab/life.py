@@ -36,7 +36,7 @@ from battery_env.records.model import ModelError
 PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE, PRIOR_DRIFT_SD_SHARE = 0.01, 0.003, 0.003
 _COLUMNS = """
     cycle q_mobile_C sd_q_mobile_C resistance_10s_ohm sd_resistance_10s_ohm settled_resistance_10s measured_resistance_10s_ohm
-    r_o_ohm settled findings reason valid capacity_Ah mean_current_A least_current_A most_current_A lasted_share model_error
+    r_o_ohm settled findings reason valid capacity_Ah mean_current_A least_current_A most_current_A lasted_share
 """.split()
 # The number of simulated lives, and of discharges ahead.
 _LIVES, _MOST = 2000, 2000
@@ -55,9 +55,8 @@ class Life:
         ``settled_resistance_10s``, ``measured_resistance_10s_ohm``, ``r_o_ohm``, ``settled``, ``findings``, ``reason``,
         ``valid`` (whether it counts), ``capacity_Ah`` (charge to the cut-off), ``mean_current_A``, ``least_current_A`` and
         ``most_current_A`` (without a few extremes), ``lasted_share`` (its duration, as a share of the model's at this
-        ``q_mobile``; NaN if it was cut short), ``model_error`` (a :class:`~battery_env.records.model.ModelError`; ``None`` if
-        it was cut short), and the prediction from the earlier discharges, ``expected_q_mobile_C`` and ``expected_sd_C`` (NaN
-        for the first)
+        ``q_mobile``; NaN if it was cut short), and the prediction from the earlier discharges, ``expected_q_mobile_C`` and
+        ``expected_sd_C`` (NaN for the first)
     :param step_share: standard deviation of the step from one discharge to the next, as a share of ``q_mobile``
     :param noise_share: standard deviation of the error that an estimate does not share with the others, as such a share
     :param drift_share: mean step, as such a share
@@ -66,6 +65,7 @@ class Life:
     :param sd_share: relative standard deviation of the last valid ``q_mobile`` with uncertain constants; or NaN
     :param usual_start: how the discharges start; ``None`` if they do not start and last alike
     :param cut_off_V: cut-off voltage of the discharges, V
+    :param model_errors: what the model missed over each discharge; ``None`` of one that was cut short. Empty: unknown
     :param alternatives: the model of the last valid discharge, and others that its constants leave open
         (:class:`~battery_env.estimators.least_squares.Alternative`)
     """
@@ -79,6 +79,7 @@ class Life:
     sd_share: float = nan
     usual_start: DischargeStart | None = None
     cut_off_V: float = nan
+    model_errors: Sequence[ModelError | None] = ()
     alternatives: Sequence[Alternative] = ()
 
     @property
@@ -174,8 +175,8 @@ class Life:
         What the model missed over the last discharge at the load of one in progress, and will miss again; ``None``: there is
         no such discharge.
         """
-        errors = self.table["model_error"][self._alike(_currents_A(running, load))].dropna()
-        return errors.iloc[-1] if len(errors) else None
+        alike = zip(self.model_errors, self._alike(_currents_A(running, load)), strict=False)
+        return next((error for error, is_alike in reversed(list(alike)) if is_alike and error is not None), None)
 
     def after(self, count: int) -> Life:
         """
@@ -187,8 +188,8 @@ class Life:
         """
         if not 1 <= check_whole_number("count", count) <= len(self.table):
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
-        unchanged = ("sd_share", "usual_start", "cut_off_V", "alternatives")
-        return replace(life_of(self.table.iloc[:count]), **{name: getattr(self, name) for name in unchanged})
+        unchanged = {name: getattr(self, name) for name in ("sd_share", "usual_start", "cut_off_V", "alternatives")}
+        return replace(life_of(self.table.iloc[:count]), model_errors=self.model_errors[:count], **unchanged)
 
     def remaining_discharges(self, threshold_Ah: float, probability: ArrayLike = BAND) -> FloatArray:
         """
@@ -297,7 +298,14 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, fixed: LeastSquare
     assert last_fit is not None  # a life without a valid discharge is refused
     estimate, alternatives = free.estimate_of(last_fit), last_fit.alternatives()
     sd_share = estimate.sd_q_mobile / estimate.q_mobile
-    return replace(life, sd_share=sd_share, usual_start=usual_start, cut_off_V=cut_off_V, alternatives=alternatives)
+    return replace(
+        life,
+        sd_share=sd_share,
+        usual_start=usual_start,
+        cut_off_V=cut_off_V,
+        model_errors=tuple(row.get("model_error") for row in rows),
+        alternatives=alternatives,
+    )
 
 
 def _currents_A(running: Discharge, load: LoadToCome | None) -> FloatArray:
@@ -331,7 +339,8 @@ def _row_of(discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: L
     *drawn_C, capacity_C = integrate_load(record.time_s, record.current_A, [*record.time_s, voltage.eod_time_s])
     start_s, end_s, measured_s = record.time_s[0], voltage.eod_time_s, discharge.eod_time_s(cut_off_V)
     error_V, (least_A, most_A) = record.voltage_V - voltage.at_samples_V, load_range_A(record.current_A[1:])
-    is_simulated = np.isfinite(error_V)
+    # in a dropout the voltage does not belong to the current
+    is_compared = np.isfinite(error_V) & np.isfinite(fit.search.error_at_samples.noise_V)
     # a finding about the resistance is none about q_mobile
     of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]
     return {
@@ -352,7 +361,7 @@ def _row_of(discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: L
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
         "model_error": None
         if isnan(measured_s)
-        else ModelError(np.array(drawn_C)[is_simulated] / estimate.q_mobile, error_V[is_simulated]),
+        else ModelError(np.array(drawn_C)[is_compared] / estimate.q_mobile, error_V[is_compared]),
     }
 
 

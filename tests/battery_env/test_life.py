@@ -172,10 +172,17 @@ class TestRealCell:
         before, running = (Discharge(each.time_s[::10], each.voltage_V[::10], each.current_A[::10]) for each in lived)
         life, end_s = track_life([before], 2.7), running.eod_time_s(2.7)
         life = replace(life, state=np.log(7000.0 / 7100.0) * np.array([1.0, 0.0]) + life.state)
-        forgetful = replace(life, table=life.table.assign(model_error=None))
+        forgetful = replace(life, model_errors=())
         seen = running.until(share * end_s)
         errors = [abs(forecast_end(seen, life=each).eod_quantile_s(0.5) / end_s - 1.0) for each in (life, forgetful)]
         assert errors[0] < 0.001 < errors[1]
+
+    def test_a_dropout_of_the_logger_is_no_error_of_the_model(self):
+        sound = self.discharges[0]
+        current_A = np.where(np.arange(len(sound.time_s)) == 80, 0.0, sound.current_A)
+        lives = [track_life([each], 2.7) for each in (sound, replace(sound, current_A=current_A))]
+        most_V = [np.abs(life.model_errors[0].error_V[20:-20]).max() for life in lives]
+        assert most_V[1] == pytest.approx(most_V[0], abs=0.01)
 
     def test_what_contradicts_is_left_out_and_the_others_count(self):
         first, second, third, fourth = self.discharges
