@@ -359,9 +359,9 @@ def _row_of(discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: L
         "least_current_A": least_A,
         "most_current_A": most_A,
         "lasted_share": (measured_s - start_s) / (end_s - start_s),
-        "model_error": None
-        if isnan(measured_s)
-        else ModelError(np.array(drawn_C)[is_compared] / estimate.q_mobile, error_V[is_compared]),
+        "model_error": (
+            None if isnan(measured_s) else ModelError(np.array(drawn_C)[is_compared] / estimate.q_mobile, error_V[is_compared])
+        ),
     }
 
 
