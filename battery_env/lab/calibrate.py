@@ -286,6 +286,10 @@ def predict(
         nominal_Ah=settings.nominal_Ah,
         samples=samples,
     )
+    if model_error is not None:
+        drawn_C = loaded.part.charge_C + loaded.load.mean_A * (end.time_s - end.now_s)
+        error_V = np.where(end.voltage_V > cut_off_V, model_error.at(drawn_C, result.q_mobile), 0.0)
+        end = replace(end, voltage_V=np.maximum(end.voltage_V + error_V, cut_off_V))
     # independent of the draws of the forecast, whose seed is 0
     gains = 1.0 + settings.current_gain_sd * np.random.default_rng([0, 1]).standard_normal(samples)
     load_A = loaded.load.mean_A if load is None else _largest_A(load, cut_off_V)

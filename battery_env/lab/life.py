@@ -21,6 +21,7 @@ from battery_env.checks import check_positive, check_whole_number
 from battery_env.compiled import compiled
 from battery_env.electrochemistry.ends import BAND, quantile
 from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
+from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason, is_only_imprecise, reason_of
 from battery_env.estimators.diagnosis.rest import starting_alike, usual_start
 from battery_env.estimators.least_squares import Alternative, LeastSquares, RecordFit
@@ -29,7 +30,7 @@ from battery_env.lab.settings import Settings
 from battery_env.loads import Load, LoadToCome, constant
 from battery_env.records import VARIED_SHARE, DischargeStart, drawn_charge_C, integrate_load, load_range_A, mean_current_A
 from battery_env.records.discharge import Discharge
-from battery_env.records.model import ModelError
+from battery_env.records.model import ModelError, RecordModel
 
 #: Priors of a life, as shares of q_mobile: the step from one discharge to the next and the independent error of an estimate
 #: (both to a factor of e, one standard deviation), and the standard deviation of the drift.
@@ -335,12 +336,9 @@ def _row_of(discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: L
     record = discharge.loaded_part(cut_off_V)
     with_free_constants = free.estimate_of(fit)
     estimate = with_free_constants if fixed.prior.nuisance == free.prior.nuisance else fixed.estimate(record)
-    voltage = fixed.model.forecast(record, estimate, cut_off_V)
-    *drawn_C, capacity_C = integrate_load(record.time_s, record.current_A, [*record.time_s, voltage.eod_time_s])
-    start_s, end_s, measured_s = record.time_s[0], voltage.eod_time_s, discharge.eod_time_s(cut_off_V)
-    error_V, (least_A, most_A) = record.voltage_V - voltage.at_samples_V, load_range_A(record.current_A[1:])
-    # in a dropout the voltage does not belong to the current
-    is_compared = np.isfinite(error_V) & np.isfinite(fit.search.error_at_samples.noise_V)
+    end_s, measured_s = fixed.model.forecast(record, estimate, cut_off_V).eod_time_s, discharge.eod_time_s(cut_off_V)
+    lasted_share = (measured_s - record.time_s[0]) / (end_s - record.time_s[0])
+    least_A, most_A = load_range_A(record.current_A[1:])
     # a finding about the resistance is none about q_mobile
     of_charge = [each for each in estimate.findings if each.number in ("", "q_mobile")]
     return {
@@ -354,15 +352,28 @@ def _row_of(discharge: Discharge, cut_off_V: float, fixed: LeastSquares, free: L
         "settled": estimate.settled,
         "findings": estimate.findings,
         "valid": estimate.settled_q_mobile or (not isnan(measured_s) and is_only_imprecise(of_charge)),
-        "capacity_Ah": capacity_C / 3600.0,
+        "capacity_Ah": float(integrate_load(record.time_s, record.current_A, end_s)) / 3600.0,
         "mean_current_A": mean_current_A(record),
         "least_current_A": least_A,
         "most_current_A": most_A,
-        "lasted_share": (measured_s - start_s) / (end_s - start_s),
+        "lasted_share": lasted_share,
         "model_error": (
-            None if isnan(measured_s) else ModelError(np.array(drawn_C)[is_compared] / estimate.q_mobile, error_V[is_compared])
+            None
+            if isnan(lasted_share)
+            else _model_error(fit, fixed.model, replace(estimate, q_mobile=lasted_share * estimate.q_mobile), measured_s)
         ),
     }
+
+
+def _model_error(fit: RecordFit, model: RecordModel, estimate: Estimate, end_s: float) -> ModelError:
+    """Return what the model misses over a discharge, at an estimate that ends when the discharge did: then nothing."""
+    record = fit.record
+    error_V = record.voltage_V - model.forecast(record, estimate, -np.inf).at_samples_V
+    # in a dropout the voltage does not belong to the current
+    is_compared = np.isfinite(error_V) & np.isfinite(fit.search.error_at_samples.noise_V) & (record.time_s < end_s)
+    times_s = np.append(record.time_s[is_compared], end_s)
+    drawn_C = integrate_load(record.time_s, record.current_A, times_s)
+    return ModelError(drawn_C / estimate.q_mobile, np.append(error_V[is_compared], 0.0))
 
 
 def life_of(table: pd.DataFrame, doubt_share: ArrayLike = 0.0) -> Life:

@@ -98,11 +98,14 @@ class ModelError(NamedTuple):
     drawn_share: FloatArray
     error_V: FloatArray
 
+    def at(self, drawn_C: FloatArray, q_mobile: float) -> FloatArray:
+        """Return the error of a discharge alike, V, where it has drawn these charges, C."""
+        return np.interp(drawn_C / q_mobile, *self)
+
     def removed_from(self, record: Record, q_mobile: float) -> Record:
         """Return a record of a discharge alike without this error."""
         time_s, voltage_V, current_A = Samples.of(record)
-        drawn_share = integrate_load(time_s, current_A, time_s) / q_mobile
-        return Samples(time_s, voltage_V - np.interp(drawn_share, *self), current_A)
+        return Samples(time_s, voltage_V - self.at(integrate_load(time_s, current_A, time_s), q_mobile), current_A)
 
 
 class Tangents(NamedTuple):

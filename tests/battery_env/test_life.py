@@ -174,8 +174,14 @@ class TestRealCell:
         life = replace(life, state=np.log(7000.0 / 7100.0) * np.array([1.0, 0.0]) + life.state)
         forgetful = replace(life, model_errors=())
         seen = running.until(share * end_s)
-        errors = [abs(forecast_end(seen, life=each).eod_quantile_s(0.5) / end_s - 1.0) for each in (life, forgetful)]
+        ends = [forecast_end(seen, life=each) for each in (life, forgetful)]
+        errors = [abs(each.eod_quantile_s(0.5) / end_s - 1.0) for each in ends]
         assert errors[0] < 0.001 < errors[1]
+        # the voltage to come, too, in its median
+        middle_s = np.linspace(seen.time_s[-1], share * end_s + 0.8 * (1.0 - share) * end_s, 20)
+        measured_V = np.interp(middle_s, running.time_s, running.voltage_V)
+        errors_V = [np.abs(np.interp(middle_s, each.time_s, each.voltage_V[1]) - measured_V).max() for each in ends]
+        assert errors_V[0] < 0.003 < 0.01 < errors_V[1]
 
     def test_a_dropout_of_the_logger_is_no_error_of_the_model(self):
         sound = self.discharges[0]
