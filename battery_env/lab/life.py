@@ -91,25 +91,29 @@ class Life:
         ``q_mobile`` of a whole discharge the model ends a little early or late, as in the discharge before: the mean corrects
         for this error.
         """
-        last = self.table[self.table["valid"]].iloc[-1]
-        return self._prior_C(1, last[["least_current_A", "most_current_A"]].to_numpy(dtype=np.float64))
+        valid, table = self.table["valid"], self.table[["least_current_A", "most_current_A"]]
+        last = table[valid].iloc[-1]
+        is_like_last = ((table - last).abs() <= VARIED_SHARE * last["most_current_A"]).all(axis=1)
+        return self._prior_C(1, np.asarray(valid & is_like_last, dtype=np.bool_))
 
-    def _prior_C(self, count: int, currents_A: FloatArray) -> tuple[float, float]:
-        """Return the prior so many discharges later at these currents, A; NaN: at any."""
-        valid = self.table["valid"].to_numpy(dtype=np.bool_)
-        mean_A, alike = self.table["mean_current_A"], self._alike(currents_A)
-        if not alike.any():
-            mean_C, sd_C = self.later_q_mobile_C(count)
-            return mean_C, hypot(sd_C, mean_C * self._doubt_share(currents_A, float(mean_A[valid].iloc[-1])))
-        life, other = self, valid & ~alike
+    def _prior_C(self, count: int, alike: BoolArray) -> tuple[float, float]:
+        """Return the prior so many discharges later at the load of these discharges."""
+        life, other = self, self.table["valid"].to_numpy(dtype=np.bool_) & ~alike
         if other.any():
-            # the walk at these currents, of which the estimates at others tell less
+            # the walk at this load, of which the estimates at others tell less
+            mean_A = self.table["mean_current_A"]
             doubt_share = self._doubt_share(mean_A[other].to_numpy(), float(mean_A[alike].iloc[-1]))
             life = life_of(self.table, np.where(other, doubt_share, 0.0))
         mean_C, sd_C = life.later_q_mobile_C(count)
         lasted_share = self.table["lasted_share"][alike].dropna()
         lasted = float(lasted_share.iloc[-1]) if len(lasted_share) else 1.0
         return lasted * mean_C, lasted * sd_C
+
+    def _prior_at_other_load_C(self, count: int, currents_A: FloatArray) -> tuple[float, float]:
+        """Return the prior so many discharges later at currents that no discharge of the life had, A; NaN: at any."""
+        mean_C, sd_C = self.later_q_mobile_C(count)
+        usual_A = float(self.table["mean_current_A"][self.table["valid"]].iloc[-1])
+        return mean_C, hypot(sd_C, mean_C * self._doubt_share(currents_A, usual_A))
 
     def _alike(self, currents_A: FloatArray) -> BoolArray:
         """Return which valid discharges have all of their currents within 5 % of all of these, A; none of NaN."""
@@ -153,7 +157,7 @@ class Life:
     @property
     def prior_at_other_loads_C(self) -> tuple[float, float]:
         """The same for a load that is not that of the life: the error that all estimates share counts too, in full."""
-        return self._prior_C(1, np.array([nan]))
+        return self._prior_at_other_load_C(1, np.array([nan]))
 
     def discharges_until(self, cycle: int | None) -> int:
         """Return how many discharges after the last one of the life a discharge is, by its number; 1 without numbers."""
@@ -169,7 +173,9 @@ class Life:
         :param load: to come, as :func:`battery_env.forecast` takes it; ``None``: as so far
         :return: mean and standard deviation of ``q_mobile``, C
         """
-        return self._prior_C(self.discharges_until(running.meta.get("cycle")), _currents_A(running, load))
+        count, currents_A = self.discharges_until(running.meta.get("cycle")), _currents_A(running, load)
+        alike = self._alike(currents_A)
+        return self._prior_C(count, alike) if alike.any() else self._prior_at_other_load_C(count, currents_A)
 
     def model_error_for(self, running: Discharge, load: LoadToCome | None = None) -> ModelError | None:
         """

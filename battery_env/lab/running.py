@@ -135,8 +135,9 @@ def forecast_end(
     :param settings: how to calibrate the record; ``None``: the defaults
     :param load: load from the last sample under load on, as for :func:`battery_env.forecast`; ``None``: as so far
     :param samples: number of samples of the forecast
-    :param life: earlier life of the cell, which gives the prior for this load; ``None``: the prior of the settings, if any.
-        With a life, or with a prior and a load, the constants are fixed: they and ``r_o`` carry over together
+    :param life: earlier life of the cell, which gives the prior for this load, and what the model misses at this load;
+        ``None``: the prior of the settings, if any. With a life, or with a prior and a load, the constants are fixed: they and
+        ``r_o`` carry over together
     :raises ValueError: if the discharge cannot be used, or the load is out of range
     """
     end = calibrate_running(discharge, Settings() if settings is None else settings, load, samples, life).end
