@@ -391,8 +391,8 @@ class LeastSquares(Estimator):
             model_ohm = step.fall_ohm(record, record.time_s, model_V, after_s)
             of_model = ModelResistance.of(record, step, fitted.search, fitted.without_prior, after_s)
             noise_ohm = MOST_NOISE_SD * sd_unit * fitted.search.error.noise_V / step.size_A
-            # in the meantime the error of the model drifts
-            drift_ohm = sd_unit * fitted.search.error.drift_after_V(step.size_A * after_s) / step.size_A
+            # the number that is reported is that after ten seconds; from then on the error of the model drifts
+            drift_ohm = sd_unit * fitted.search.error.drift_after_V(step.size_A * (after_s - PULSE_S)) / step.size_A
             sd_ohm = hypot(sd_unit * of_model.sd_ohm, drift_ohm)
             apart_ohm = abs(measured_ohm - model_ohm)
             # the measurement and the fit may have different moments of the switch
