@@ -181,7 +181,7 @@ class TestRealCell:
         middle_s = np.linspace(seen.time_s[-1], share * end_s + 0.8 * (1.0 - share) * end_s, 20)
         measured_V = np.interp(middle_s, running.time_s, running.voltage_V)
         errors_V = [np.abs(np.interp(middle_s, each.time_s, each.voltage_V[1]) - measured_V).max() for each in ends]
-        assert errors_V[0] < 0.003 < 0.01 < errors_V[1]
+        assert errors_V[0] < 0.005 < 0.02 < errors_V[1]
 
     def test_a_dropout_of_the_logger_is_no_error_of_the_model(self):
         sound = self.discharges[0]
