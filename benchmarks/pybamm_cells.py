@@ -10,9 +10,9 @@ electrolyte), looked at as a lab does with its own.
 A cell is worn from discharge to discharge: it loses active material on both sides, and its contacts get worse. Every fourth
 discharge has a current that changes each minute, the others a constant one. Constants are fitted to three discharges at a
 constant current and two at a varying one, over the life. Of each other discharge the first 25, 50 and 75 % of the time are
-seen: when will it end, by the fit alone, and by the six discharges before as well? And how far is q_max of whole discharges
-in other surroundings than those of the fit from that of the same cell there? That an end keeps to what a cell holds over its
-life was found on these cells; no number was chosen on them.
+seen: when will it end, by the fit alone, by the six discharges before as well, and without either? And how far is q_max of
+whole discharges in other surroundings than those of the fit from that of the same cell there? That an end keeps to what a cell
+holds over its life was found on these cells; no number was chosen on them.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from matplotlib.figure import Figure
 from battery_env import Discharge, Settings, calibrate, fit_cell, track_life
 from battery_env.arrays import FloatArray
 from battery_env.checks import ZERO_CELSIUS_K
+from battery_env.lab.life import Life
 from battery_env.lab.report import Calibration
 from battery_env.lab.running import forecast_end
 from battery_env.loads import Load
@@ -57,7 +58,7 @@ SHARES = (0.25, 0.5, 0.75)
 DISCHARGES, BEFORE = 24, 6
 #: Those that constants are fitted to.
 FITTED = (0, 7, 10, 19, 22)
-FIT, LIFE = "the fit", "the fit and six discharges before"
+FIT, LIFE, OF_SIZE, NOTHING = "the fit", "the fit and six discharges before", "the nominal capacity", "nothing"
 #: Constant current, and range of one that varies, over the nominal capacity, 1/h.
 RATE, RATES, MINUTE_S = 0.8, (0.3, 1.3), 60.0
 #: What a life takes of the active material of the negative and the positive electrode, and how many times larger contacts get.
@@ -72,10 +73,11 @@ SAMPLING_S, NOISE_V, NOISE_A = 10.0, 0.001, 2e-4
 
 
 class SimulatedLife(NamedTuple):
-    """A life, and where its discharges end."""
+    """A life, where its discharges end, and the nominal capacity of the cell."""
 
     discharges: list[Discharge]
     cut_off_V: float
+    nominal_Ah: float
 
 
 def varies(n: int) -> bool:
@@ -119,7 +121,7 @@ def simulated(
         voltage_V = voltage_V + rng.normal(0.0, NOISE_V, len(time_s))
         current_A = current_A + rng.normal(0.0, NOISE_A * capacity_Ah, len(time_s)) * (current_A > 0.0)
         made.append(Discharge(time_s, voltage_V, current_A, temperature_C))
-    return SimulatedLife(made, cut_off_V)
+    return SimulatedLife(made, cut_off_V, capacity_Ah)
 
 
 def to_come(discharge: Discharge, seen: Discharge) -> Load:
@@ -130,9 +132,9 @@ def to_come(discharge: Discharge, seen: Discharge) -> Load:
 
 def part(cell: str, seed: int) -> Tables:
     """A cell: simulate its life, fit it, and forecast the discharges that were not fitted."""
-    life, cut_off_V = simulated(cell, seed)
+    life, cut_off_V, nominal_Ah = simulated(cell, seed)
     fit = fit_cell([life[n] for n in FITTED], cut_off_V)
-    settings = Settings(cell=fit)
+    settings, nothing = Settings(cell=fit), Settings(cut_off_V=cut_off_V)
     rows: list[dict[str, Any]] = []
     for n, discharge in enumerate(life):
         if n in FITTED or n < BEFORE:
@@ -141,12 +143,18 @@ def part(cell: str, seed: int) -> Tables:
         common = {"cell": cell, "discharge": n, "varies": varies(n), "seed": seed, "fit_rmse_V": fit.rmse_V}
         rows.append({**common, "knows": FIT, "share": 1.0, "settled": float(found.settled_q_mobile)})
         before = track_life(life[n - BEFORE : n], cut_off_V, fit.calibrator())
+        known: dict[str, tuple[Settings, Life | None]] = {
+            FIT: (settings, None),
+            LIFE: (settings, before),
+            OF_SIZE: (Settings(cut_off_V=cut_off_V, nominal_Ah=nominal_Ah), None),
+            NOTHING: (nothing, None),
+        }
         start_s, end_s = discharge.loaded_part(cut_off_V).time_s[[0, -1]].tolist()
         for share in SHARES:
             seen = discharge.until(start_s + share * (end_s - start_s))
             load = to_come(discharge, seen) if varies(n) else None
-            for knows, own in ((FIT, None), (LIFE, before)):
-                quantiles_s = forecast_end(seen, settings, load, life=own).eod_quantile_s()
+            for knows, (stated, own) in known.items():
+                quantiles_s = forecast_end(seen, stated, load, life=own).eod_quantile_s()
                 rows.append({**common, "knows": knows, "share": share, **end_in_percent(quantiles_s, start_s, end_s)})
     there, surroundings = calibrate(life[MOVED], settings), []
     for other_C in OTHERS_C:
@@ -216,8 +224,8 @@ def draw_ends(axes: Axes, forecasts: Iterable[tuple[str, tuple[Any, pd.DataFrame
 
 
 def plot(rows: pd.DataFrame) -> Figure:
-    """The error of the end and its interval after half of the time, over the life of each cell."""
-    half = rows[rows["share"] == 0.5]
+    """The error of the end and its interval after half of the time, over the life of each cell that was fitted."""
+    half = rows[(rows["share"] == 0.5) & rows["knows"].isin([FIT, LIFE])]
     figure, panels = new_panels(len(CELLS), 3, (3.4, 3.0))
     for axes, (cell, of_cell) in zip(panels, half.groupby("cell", sort=False), strict=False):
         draw_ends(axes, coloured(of_cell.groupby("knows", sort=False)), CELLS[str(cell)])

@@ -15,7 +15,7 @@ def life(name, seed, numbers=range(12), surroundings_C=25.0):
     for n in numbers:
         load = 2.0 if not varies(n) else np.repeat(rng.uniform(0.7, 3.0, 300), 60)
         made.append(simulate(load, 7000.0 - 60.0 * n, 0.1 + 0.003 * n, load_unit="current", cell=NEW_CELL.replace(VEOD=2.4)))
-    return SimulatedLife([recorded(each, slice(None, None, 5)) for each in made], 2.7)
+    return SimulatedLife([recorded(each, slice(None, None, 5)) for each in made], 2.7, 2.0)
 
 
 @pytest.mark.attacks
@@ -27,7 +27,7 @@ def test_what_is_known_of_a_cell_brings_its_end_nearer(monkeypatch, tmp_path, ca
     pybamm_cells.main(asked)
     rows = pd.read_csv(tmp_path / "pybamm_cells.csv")
     # discharges 6, 8, 9 and 11 are tested
-    assert len(rows) == 4 * (1 + 2 * len(SHARES)) and rows["varies"].sum() == 1 + 2 * len(SHARES)
+    assert len(rows) == 4 * (1 + 4 * len(SHARES)) and rows["varies"].sum() == 1 + 4 * len(SHARES)
     ends = rows[rows["share"] < 1.0]
     assert ends["inside"].all() and rows["settled"].dropna().all()
     narrow, wide = (ends[ends["knows"] == each] for each in (LIFE, FIT))
