@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from battery_env.electrochemistry import FloatArray, Trajectory
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import Trajectory
 
 
 @dataclass(frozen=True)

@@ -111,9 +111,7 @@ class AgingPath:
         :return: the cells
         :raises ValueError: for no cells, or a negative seed
         """
-        n, seed = check_whole_number("n", n), check_whole_number("seed", seed)
-        if n < 1 or seed < 0:
-            raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
+        n, seed = check_whole_number("n", n, 1), check_whole_number("seed", seed, 0)
         rng = np.random.default_rng(seed)
         low, high = -PATH_EXTRAPOLATION_SHARE, 1.0 + PATH_EXTRAPOLATION_SHARE
         life, place = rng.integers(len(self.lives), size=n), rng.uniform(low, high, size=n)
@@ -139,10 +137,7 @@ class AgingPath:
 
     @property
     def sd_ratio(self) -> float:
-        """
-        Ratio of the standard deviations that an estimate states, and that decide whether ``q_mobile`` is settled, to the
-        standard deviations of a fit along the path: 3 for the path of one life, 2 for the path of two lives.
-        """
+        """Ratio of the standard deviations of an estimate to those of a fit along the path: 3 for one life, 2 for two."""
         return 1.0 + _LIVES_SD_TERM / len(self.lives)
 
     def distance_sd(self, values: Mapping[str, float]) -> float:
@@ -236,7 +231,6 @@ def cell_with(cell: CellParameters, constants: Mapping[str, float] | None) -> Ce
 
 def _interpolate(rows: FloatArray, place: FloatArray) -> FloatArray:
     """Return values at places of a life: linear between two ages, and extrapolated with the slopes at its ends."""
-
     last = len(rows) - 1
     position = np.clip(place, 0.0, 1.0) * last
     lower = np.minimum(position.astype(np.int64), last - 1)

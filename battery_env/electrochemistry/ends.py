@@ -111,15 +111,10 @@ def simulate_to_cut_off(
     model: Model,
     loads: Sequence[FutureLoad],
     cut_off_V: float,
-    every_s: float | None = None,
-    surplus_share: float = SURPLUS_SHARE,
+    every_s: float | None = None,  # between samples of the course; None: no course
+    surplus_share: float = SURPLUS_SHARE,  # a load that charges a cell further beyond full is refused
 ) -> EndsOfDischarge:
-    """
-    Discharge cells to the cut-off, for a week at most, under loads in one unit, one for all cells or one a cell.
-
-    The course of the voltage has a sample every ``every_s``, or none. The function refuses a load that charges a cell beyond
-    full by more than ``surplus_share`` of its charge.
-    """
+    """Discharge cells to the cut-off, for a week at most, under loads in one unit, one for all cells or one a cell."""
     count, dt_s, power = len(cells.q_mobile), model.dt_s, loads[0].unit == "power"
     end_step = np.broadcast_to(np.ceil(np.minimum([load.until_s for load in loads], LONGEST_S) / dt_s - 1e-9), count)
     progress = _initial_progress(cells, end_step)

@@ -143,11 +143,6 @@ class Life:
         difference = (share[1:] - share[0]) / np.maximum(share[1:], share[0])
         return sqrt(0.5 * float(np.nansum(difference**2)))
 
-    @property
-    def next_q_mobile_C(self) -> tuple[float, float]:
-        """Mean and standard deviation of ``q_mobile`` in the next discharge, C."""
-        return self.later_q_mobile_C(1)
-
     def later_q_mobile_C(self, count: int) -> tuple[float, float]:
         """Mean and standard deviation of ``q_mobile`` so many discharges after the last one, C."""
         weights = np.array([1.0, count])
@@ -193,7 +188,7 @@ class Life:
         :return: that part of the life, with the sizes of step and noise that it shows
         :raises ValueError: for fewer discharges than one or more than there are, or if none of them is valid
         """
-        if not 1 <= check_whole_number("count", count) <= len(self.table):
+        if check_whole_number("count", count, 1) > len(self.table):
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
         unchanged = {name: getattr(self, name) for name in ("sd_share", "usual_start", "cut_off_V", "alternatives")}
         return replace(life_of(self.table.iloc[:count]), model_errors=self.model_errors[:count], **unchanged)
@@ -300,8 +295,8 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, fixed: LeastSquare
                     "findings": (Finding.of(Reason.OTHER, message=str(error)),),
                 }
             )
-    texts = [{"reason": reason_of(row["findings"])} for row in rows]
-    life = life_of(pd.DataFrame([row | text for row, text in zip(rows, texts, strict=True)], columns=_COLUMNS))
+    table = pd.DataFrame(rows, columns=_COLUMNS)
+    life = life_of(table.assign(reason=[reason_of(each) for each in table["findings"]]))
     assert last_fit is not None  # a life without a valid discharge is refused
     estimate, alternatives = free.estimate_of(last_fit), last_fit.alternatives()
     sd_share = estimate.sd_q_mobile / estimate.q_mobile
@@ -383,12 +378,7 @@ def _model_error(fit: RecordFit, model: RecordModel, estimate: Estimate, end_s: 
 
 
 def life_of(table: pd.DataFrame, doubt_share: ArrayLike = 0.0) -> Life:
-    """
-    Follow ``q_mobile`` over the rows of a table, as :class:`Life` has it.
-
-    :param table: one row per discharge
-    :param doubt_share: further standard deviations of the estimates, as shares of ``q_mobile``, shape (discharges,)
-    """
+    """Follow ``q_mobile`` over the rows of a table; ``doubt_share``: further relative standard deviations of the estimates."""
     valid = table["valid"].to_numpy(dtype=np.bool_)
     if not valid.any():
         raise ValueError(f"no discharge determines q_mobile. {_most_common(table['findings'])}")

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.estimators.estimator import Record
+from battery_env.records import Record
 from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask
 
 _ROW = np.zeros(1, dtype=np.intp)

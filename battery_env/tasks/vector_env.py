@@ -12,7 +12,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from battery_env.electrochemistry import FloatArray
+from battery_env.arrays import FloatArray
+from battery_env.checks import check_whole_number
 from battery_env.tasks.base import CalibrationTask
 from battery_env.tasks.env import CalibrationEnv, new_task, spaces_of
 
@@ -45,9 +46,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs!r}")
-        self.num_envs = num_envs
+        self.num_envs = check_whole_number("num_envs", num_envs, 1)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.DISABLED:
             raise ValueError("autoreset_mode must be 'NextStep' or 'SameStep', got 'Disabled'")

@@ -103,10 +103,7 @@ class FitPrior:
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, tuple[float, float]], offset_V: float, nuisance: float) -> FitPrior:
-        """
-        Make a prior of independent unknowns: parameters have the mean and the standard deviation of their ranges, C and ohm,
-        and constants the relative standard deviation ``nuisance``.
-        """
+        """Make a prior of parameters, uniform over ranges, C and ohm, and constants of this relative standard deviation."""
         limits = np.array(list(ranges.values()))
         constants = np.full(len(UNCERTAIN_CONSTANTS), np.sqrt(np.log1p(nuisance**2)))
         uniform = np.append(np.ptp(limits, axis=1), 2.0 * offset_V) / np.sqrt(12.0)
@@ -162,7 +159,8 @@ class NuisanceFit:
         self._prior_rows = StepPrior(means, units, prior.precision, prior.flat_precision, mismatch_V, errors_per_C)
         self._first = np.zeros(unknowns - _KN) if prior.path is None else prior.mean[_KN:]
         self.constants = np.tile(self._first, (cells, 1))
-        self._solution = np.zeros((cells, solution_size(unknowns)))
+        # of each cell a step and an sd of each unknown, the noise, and two sds under a flat prior
+        self._solution = np.zeros((cells, 2 * unknowns + 3))
         self._equilibrium = _equilibrium_terms(cell, unknowns - _EQUILIBRIUM)
         self.observation_size = 2 * len(PARAMETER_NAMES) + 2 + unknowns - _KN
 
@@ -212,11 +210,6 @@ class NuisanceFit:
             np.arcsinh(self._solution[:, _OFFSET, None] / VOLTAGE_SCALE_V),
             (self.constants - self._first) / self.prior.observation_scale,
         ]
-
-
-def solution_size(unknowns: int) -> int:
-    """Return the length of a solution: a step and an sd of each unknown, the noise, and two sds under a flat prior."""
-    return 2 * unknowns + 3
 
 
 @lru_cache(maxsize=4)
@@ -507,12 +500,8 @@ def nuisance_step(
     prior: StepPrior,
     solution: FloatArray,
 ) -> None:
-    """
-    Take one Gauss-Newton step towards the best unknowns of each cell under their prior, into ``solution``, shape (n,
-    ``solution_size``); unchecked, all arrays contiguous. ``equilibrium_terms`` are those of the coefficients among the
-    constants, shape (coefficients, 1 + POLYNOMIAL_SIZE); other arguments as of
-    :func:`battery_env.tasks.voltage.readings.summarise_residuals`.
-    """
+    # Take one Gauss-Newton step towards the best unknowns of each cell under their prior, into solution; unchecked. Arguments
+    # as of summarise_residuals, and the equilibrium_terms of the coefficients among the constants
     unknowns = prior.mean.shape[1]
     sums, values = np.empty((unknowns + 1, unknowns + 1)), np.zeros(unknowns)
     for n in rows:

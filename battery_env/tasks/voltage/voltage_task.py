@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray, IntArray
-from battery_env.checks import check_not_negative
+from battery_env.checks import check_not_negative, check_whole_number
 from battery_env.electrochemistry import CellParameters, check_cell
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
-from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
+from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, checked_action
 from battery_env.tasks.data import LoadKind, Split, open_dataset, standard_dataset
 from battery_env.tasks.voltage.fit import VOLTAGE_SCALE_V, FitPrior, FitResult, NuisanceFit
 from battery_env.tasks.voltage.readings import CURRENT, MEASURED, OHMIC, SENSOR_ROWS, Readings, summarise_residuals
@@ -101,7 +101,6 @@ class VoltageTask(CalibrationTask):
         dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **sensors: Any,
     ) -> None:
-        check_counts(episode_steps=episode_steps)
         check_not_negative(process_noise_V=process_noise_V, nuisance=nuisance)
         if not 0 <= new_readings[0] <= new_readings[1]:
             raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
@@ -115,7 +114,8 @@ class VoltageTask(CalibrationTask):
                 raise ValueError("path says how far constants are off: leave nuisance and mismatch out")
         choices = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
         self._open(dataset, reading_s, cell, path, choices)
-        self.cells, self.new_readings, self.episode_steps = cells, new_readings, episode_steps
+        self.cells, self.new_readings = cells, new_readings
+        self.episode_steps = check_whole_number("episode_steps", episode_steps, 1)
         self.sensors = replace(SENSORS, **sensors)
         self.process_noise_V, self.first_estimate = process_noise_V, start
         self.decision_s = self.readings.interval_s * (sum(new_readings) / 2.0)
@@ -203,10 +203,7 @@ class VoltageTask(CalibrationTask):
 
     @classmethod
     def options(cls) -> dict[str, Any]:
-        """
-        Return the options of the task, which its page explains; those of the sensors are the fields of
-        :class:`~battery_env.sensors.RandomSensorErrors`.
-        """
+        """Return the options of the task, which its page explains, and of its sensors."""
         return {**super().options(), **asdict(SENSORS)}
 
     def start(self, rows: Rows, generators: Generators, options: Mapping[str, Any] | None = None) -> None:
@@ -400,7 +397,6 @@ class VoltageTask(CalibrationTask):
 
     def report(self) -> dict[str, FloatArray]:
         """Return the state of each cell; true parameters are NaN for recorded discharges, ``voltage`` is measured."""
-
         data, last = self.readings, self.count - 1
         true_q_C = data.q_mobile[self.discharge]
         return {
