@@ -164,12 +164,6 @@ def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> d
     return dict(content)
 
 
-def npz_path(path: str | os.PathLike[str]) -> Path:
-    """Return the path with the suffix .npz."""
-    target = Path(path)
-    return target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
-
-
 def read_npz(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read arrays and metadata; refuse a damaged file, or another kind of file."""
     with Path(path).open("rb") as stream:

@@ -31,7 +31,7 @@ from battery_env.electrochemistry import (
 from battery_env.electrochemistry.aging_path import EQUILIBRIUM_SIZE, AgingPath
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.kernels import roll_out
-from battery_env.files import npz_path, read_npz, replacing
+from battery_env.files import read_npz, replacing
 from battery_env.loads import Load, LoadSampler, constant
 from battery_env.parameters import Q_MOBILE, R_O, check_parameters
 
@@ -274,8 +274,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
             use a :meth:`subset` instead
         :raises ValueError: for no trajectories, or trajectories that differ otherwise
         """
-        if isinstance(trajectories, Trajectory):
-            raise TypeError("trajectories must be a list of them, got one Trajectory")
         for trajectory in trajectories:
             if not isinstance(trajectory, Trajectory):
                 raise TypeError(f"trajectories must hold Trajectory, got {type(trajectory).__name__}")
@@ -437,7 +435,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :raises FileExistsError: if the file exists already
         """
         settings = {name: getattr(self, name) for name in _SETTINGS} | {"cell": asdict(self.cell)}
-        target, metadata = npz_path(path), json.dumps({**settings, "kind": _KIND, "format": _FORMAT})
+        target, metadata = Path(path), json.dumps({**settings, "kind": _KIND, "format": _FORMAT})
+        target = target.with_name(f"{target.name.removesuffix('.npz')}.npz")
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
         with replacing(target, new=True) as temporary:
             np.savez_compressed(temporary, metadata=np.array(metadata), **arrays)

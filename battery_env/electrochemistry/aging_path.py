@@ -13,7 +13,7 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive, check_whole_number
-from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS, CellParameters, check_cell
+from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import ERRORS_PER_DISCHARGE
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
@@ -88,9 +88,8 @@ class AgingPath:
     mismatch_V: float
 
     def __post_init__(self) -> None:
-        if self.cell is None:
-            raise TypeError("cell must be CellParameters, got None")
-        check_cell(self.cell)
+        if not isinstance(self.cell, CellParameters):
+            raise TypeError(f"cell must be CellParameters, got {self.cell!r}")
         check_positive("mismatch_V", self.mismatch_V)
         if not self.lives:
             raise ValueError("a path is of at least one life")
@@ -137,7 +136,10 @@ class AgingPath:
 
     @property
     def sd_ratio(self) -> float:
-        """Ratio of the standard deviations of an estimate to those of a fit along the path: 3 for one life, 2 for two."""
+        """
+        Ratio of the standard deviations that an estimate states, and that decide whether ``q_mobile`` is settled, to the
+        standard deviations of a fit along the path: 3 for the path of one life, 2 for the path of two lives.
+        """
         return 1.0 + _LIVES_SD_TERM / len(self.lives)
 
     def distance_sd(self, values: Mapping[str, float]) -> float:

@@ -36,7 +36,6 @@ SURPLUS_SHARE = 0.01
 _CHUNK_STEPS = 512
 # Rows of the progress of cells: parameters and errors, sum of currents, last current and voltage, and the end of discharge.
 _Q, _R_O, _ERROR, _DRIFT, _FIRST_SOC, _LAST_STEP, _SUM_A, _LAST_A, _LAST_V, _END, _END_SOC = range(11)
-_INITIAL_PROGRESS = (0.0, np.nan, np.nan, np.inf, np.nan)
 
 
 class Model(Protocol):
@@ -182,7 +181,7 @@ class _Run(NamedTuple):
 def _initial_progress(cells: Cells, end_step: FloatArray) -> FloatArray:
     """Return the progress of cells before the first step."""
     initial = (cells.q_mobile, cells.r_o, cells.error_V, cells.drift_V, cells.soc, end_step)
-    return np.vstack([*initial, np.repeat(np.array(_INITIAL_PROGRESS)[:, None], len(end_step), axis=1)])
+    return np.vstack([*initial, *(np.full_like(end_step, value) for value in (0.0, np.nan, np.nan, np.inf, np.nan))])
 
 
 @compiled

@@ -20,13 +20,13 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
 
-from battery_env import __version__
 from battery_env.estimates.findings import codes_of, findings_of
 from battery_env.files import check_folder, locked, replacing
 from battery_env.lab.calibrate import calibrate
@@ -53,6 +53,9 @@ from battery_env.records.recording import Recording
 from battery_env.records.refusals import RecordError
 
 __all__ = ["FileFormat", "Outcome", "Results", "Source", "calibrate_all", "find_sources", "read_source"]
+
+#: Version of the package.
+VERSION = resources.files("battery_env").joinpath("version.txt").read_text(encoding="utf-8").strip()
 
 _FORMAT = "battery_env.run"
 # These columns have no values for unusable discharges.
@@ -264,7 +267,7 @@ class Results:
         self._stamps: dict[str, list[Any] | None] = {}  # of the files of all rows
         read_from = sorted({key_of(source.given) for source in sources})
         made_with = {**asdict(settings), **asdict(file_format), "sources": read_from, "voltages": with_voltages}
-        self._header: dict[str, Any] = json.loads(_json({"format": _FORMAT, "battery_env": __version__, **made_with}))
+        self._header: dict[str, Any] = json.loads(_json({"format": _FORMAT, "battery_env": VERSION, **made_with}))
         self._rows: dict[tuple[str, int], dict[str, Any]] = {}
         self._counts: dict[str, int] = {}
         #: Names of the files written by this run.

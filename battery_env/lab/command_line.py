@@ -20,13 +20,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
-from battery_env import __version__
 from battery_env.compiled import announce_compilation
 from battery_env.estimators.diagnosis.rest import InitialSoc
 from battery_env.estimators.joint_fit import fit_cell
 from battery_env.estimators.search import spread_over
 from battery_env.files import check_new, finite_or_none, replacing
-from battery_env.lab.batch import Outcome, Results, calibrate_all, interruptible, workers
+from battery_env.lab.batch import VERSION, Outcome, Results, calibrate_all, interruptible, workers
 from battery_env.lab.page_server import serve
 from battery_env.lab.readers.columns import FileFormat, few_of, recognise
 from battery_env.lab.readers.tables import open_file
@@ -110,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action="version", version=f"battery_env {__version__}")
+    parser.add_argument("--version", action="version", version=f"battery_env {VERSION}")
     parser.add_argument("records", nargs="+", metavar="FILE", help=_FILE_HELP)
     _add_reading(parser)
     group = parser.add_argument_group("calibration")

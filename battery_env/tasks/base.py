@@ -23,16 +23,6 @@ Generators = Sequence[np.random.Generator]
 OBSERVATION_LIMIT = 100.0
 
 
-def checked_action(action: NDArray[np.floating], shape: tuple[int, ...]) -> FloatArray:
-    """Refuse an invalid action: compiled code would read beyond a short array, and NaN would spread through the episode."""
-    array = np.asarray(action)
-    if array.dtype.kind not in "fiu" or array.shape != shape:
-        raise ValueError(f"action must hold numbers, shape {shape}, got {array.dtype} values of shape {array.shape}")
-    if np.isnan(array).any():
-        raise ValueError(f"action must hold numbers in [-1, 1], got NaN: {array}")
-    return np.asarray(array, dtype=np.float64, order="C")
-
-
 class CalibrationTask(ABC):
     """
     A calibration task as a Markov decision process, for ``cells`` cells side by side, each in its own episode.
@@ -106,6 +96,15 @@ class CalibrationTask(ABC):
         :return: cost, shape (cells,), at least 0
         :raises ValueError: for another shape, NaN, or a value that is no number
         """
+
+    def _checked_action(self, action: NDArray[np.floating]) -> FloatArray:
+        """Refuse an invalid action: compiled code would read beyond a short array, and NaN would spread."""
+        array, shape = np.asarray(action), (self.cells, len(self.parameters))
+        if array.dtype.kind not in "fiu" or array.shape != shape:
+            raise ValueError(f"action must hold numbers, shape {shape}, got {array.dtype} values of shape {array.shape}")
+        if np.isnan(array).any():
+            raise ValueError(f"action must hold numbers in [-1, 1], got NaN: {array}")
+        return np.asarray(array, dtype=np.float64, order="C")
 
     @abstractmethod
     def truncated(self) -> NDArray[np.bool_]:

@@ -14,7 +14,7 @@ from battery_env.checks import check_not_negative, check_whole_number
 from battery_env.electrochemistry import NEW_CELL, Trajectory
 from battery_env.electrochemistry.kernels import voltage_batch
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, checked_action
+from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows
 from battery_env.tasks.data import Split, open_dataset, standard_dataset
 from battery_env.tasks.full_state.decisions import decide, look_ahead, observe
 from battery_env.tasks.full_state.layout import (
@@ -182,7 +182,7 @@ class FullStateTask(CalibrationTask):
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """Take the actions, step the model, and move on to the next sample."""
-        actions, cost = checked_action(action, (self.cells, len(self.parameters))), np.empty(self.cells)
+        actions, cost = self._checked_action(action), np.empty(self.cells)
         decide(actions, self._settings, self.cell_records, cost)
         self._look_ahead(self.cell_records)
         return cost

@@ -67,8 +67,8 @@ _FLAT_PRECISION = 1e-6
 #: Scales of an observation; the scale of a standard deviation is this share of the range of the estimate
 VOLTAGE_SCALE_V = 0.010
 _SD_SCALE = 0.01
-# Least standard deviation of the noise, V.
-_MIN_NOISE_V = 0.001
+#: Least standard deviation of the noise of a voltage sensor, V.
+LEAST_NOISE_V = 0.001
 # Iterations of the noise estimate from the residuals after the step
 _NOISE_ROUNDS = 3
 
@@ -103,7 +103,7 @@ class FitPrior:
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, tuple[float, float]], offset_V: float, nuisance: float) -> FitPrior:
-        """Make a prior of parameters, uniform over ranges, C and ohm, and constants of this relative standard deviation."""
+        """Make a prior of parameters with the moments of their ranges, C and ohm, and constants of this relative sd."""
         limits = np.array(list(ranges.values()))
         constants = np.full(len(UNCERTAIN_CONSTANTS), np.sqrt(np.log1p(nuisance**2)))
         uniform = np.append(np.ptp(limits, axis=1), 2.0 * offset_V) / np.sqrt(12.0)
@@ -509,6 +509,6 @@ def nuisance_step(
         values[_Q], values[_R] = estimate[n, 0], estimate[n, 1]
         values[_KN:] = constants[n]
         errors = independent_errors(max(drawn_C, 0.0), prior.errors_per_C)
-        least_noise_V = np.sqrt(_MIN_NOISE_V**2 + prior.mismatch_V**2 * count[n] / errors)
+        least_noise_V = np.sqrt(LEAST_NOISE_V**2 + prior.mismatch_V**2 * count[n] / errors)
         mean, units, precision, flat_precision = prior.mean[n], prior.units[n], prior.precision, prior.flat_precision
         _solve_under_priors(sums, values, count[n], least_noise_V, mean, units, precision, flat_precision, solution[n])
