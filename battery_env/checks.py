@@ -98,12 +98,15 @@ def check_not_negative(**values: float) -> None:
             raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
 
 
-def check_whole_number(name: str, value: int) -> int:
-    """Refuse a value that is no whole number."""
+def check_whole_number(name: str, value: int, least: int) -> int:
+    """Refuse a value that is no whole number, or too small."""
     try:
-        return operator.index(value)
+        number = operator.index(value)
     except TypeError as error:
         raise TypeError(f"{name} must be a whole number, got {value!r}") from error
+    if number < least:
+        raise ValueError(f"{name} must be at least {least}, got {value!r}")
+    return number
 
 
 def check_indices(name: str, values: ArrayLike, size: int) -> IntArray:

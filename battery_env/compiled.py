@@ -36,10 +36,8 @@ def digest_of_kernels(package: Path = _PACKAGE) -> str:
 
 @cache
 def forget_outdated(folder: Path, digest: str) -> None:
-    """
-    Remove the kernels in a folder that were compiled from other code. Numba compares a kernel only with its module: after an
-    update in place, as by git, it would mix kernels of two versions.
-    """
+    """Remove the kernels in a folder that were compiled from other code."""
+    # numba compares a kernel only with its module: after an update in place, as by git, it would mix kernels of two versions
     digest_file = folder / "battery_env.sha256"
     with suppress(OSError):  # another process was faster, or the folder is not writable
         if not digest_file.exists() or digest_file.read_text(encoding="utf-8") != digest:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -90,13 +90,11 @@ def evaluate(
     # on the clock of the data set, where single trajectories start at 0
     truth = data if isinstance(data, TrajectoryDataset) else [_from_zero(record) for record in data]
     measured: Sequence[Trajectory] = truth
-    errors_of: list[SensorErrors | None] = [None] * len(truth)
+    errors_of = [SensorErrors()] * len(truth)
     if sensor_errors is not None:
         generators = [np.random.default_rng((seed, n)) for n in range(len(truth))]
         errors_of = [sensor_errors.draw(rng) for rng in generators]
-        measured = [
-            errors.apply(record, rng) for errors, record, rng in zip(errors_of, truth, generators, strict=True) if errors
-        ]
+        measured = [errors.apply(record, rng) for errors, record, rng in zip(errors_of, truth, generators, strict=True)]
     start = time.perf_counter()
     traces = estimator.trace(measured)
     elapsed_s = time.perf_counter() - start
@@ -159,25 +157,22 @@ def _forecasts(dataset: TrajectoryDataset, n: int, record: Trajectory, trace: Es
     load = dataset.load_profile(n)
     # beyond the record the last load continues, for as long again
     load = np.concatenate([load, np.full(len(load), load[-1])])
-    settings: dict[str, Any] = {
-        "dt": dataset.dt_s,
-        "load_unit": dataset.load_unit,
-        "thermal": dataset.thermal,
-        "cell": dataset.cell,
-    }
+    simulated = partial(
+        simulate, load, dt=dataset.dt_s, load_unit=dataset.load_unit, thermal=dataset.thermal, cell=dataset.cell
+    )
     errors_s = dict.fromkeys(["eod_error_s", *columns], np.nan)
     for column, estimate in zip(errors_s, estimate_rows, strict=True):
         values = {name: getattr(trace, name)[estimate] for name in PARAMETERS}
         is_within = all(PARAMETERS[name].limits[0] <= value <= PARAMETERS[name].limits[1] for name, value in values.items())
         if dataset.starts_full(n) and estimate >= 0 and is_within:
-            errors_s[column] = simulate(load, **values, **settings).eod_time_s - record.eod_time_s
+            errors_s[column] = simulated(**values).eod_time_s - record.eod_time_s
     return errors_s
 
 
 def _bounds(
-    dataset: TrajectoryDataset, record: Trajectory, trace: EstimateTrace, sensor_errors: SensorErrors | None
+    dataset: TrajectoryDataset, record: Trajectory, trace: EstimateTrace, sensor_errors: SensorErrors
 ) -> dict[str, float]:
-    if sensor_errors is None or sensor_errors.noise_V == 0.0:
+    if sensor_errors.noise_V == 0.0:
         return {f"{name}_bound": np.nan for name in PARAMETERS}
     model = RecordModel(dataset.cell, dataset.thermal, dataset.dt_s, initial=record.state[0])
     unknown = [name for name in PARAMETERS if _states_sd(trace, name)] or PARAMETER_NAMES

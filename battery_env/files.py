@@ -103,13 +103,6 @@ def _sync_folder(folder: Path) -> None:
             os.close(handle)
 
 
-def rename_damaged(path: Path) -> Path:
-    """Rename a damaged file, so that nothing is lost and its name is free."""
-    damaged = path.with_name(f"{path.name}.{secrets.token_hex(4)}.damaged")
-    os.replace(path, damaged)
-    return damaged
-
-
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Lock a file, which need not exist, against other commands; the lock ends with the process."""
@@ -171,12 +164,6 @@ def read_json(path: str | os.PathLike[str], file_format: str, version: int) -> d
     return dict(content)
 
 
-def npz_path(path: str | os.PathLike[str]) -> Path:
-    """Return the path with the suffix .npz."""
-    target = Path(path)
-    return target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
-
-
 def read_npz(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read arrays and metadata; refuse a damaged file, or another kind of file."""
     with Path(path).open("rb") as stream:
@@ -184,7 +171,9 @@ def read_npz(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, NDArray
         stream.seek(0)
         try:
             with np.load(stream, allow_pickle=False) as file:
-                check_unpacked(size, sum(entry.file_size for entry in file.zip.infolist()))
+                unpacked = sum(entry.file_size for entry in file.zip.infolist())
+                if unpacked > max(LARGEST_UNPACKED_BYTES, MOST_UNPACKED * size):  # unlike measurements
+                    raise ValueError(f"{size} bytes would become more than {unpacked >> 20} MiB: unpack it by hand")
                 if damaged_name := file.zip.testzip():
                     raise ValueError(f"the checksum of {damaged_name} is wrong")
                 metadata = json.loads(str(file["metadata"]))
@@ -195,21 +184,8 @@ def read_npz(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, NDArray
             raise ValueError(f"{path} is damaged, or no {kind}: {error}") from error
 
 
-def check_unpacked(packed_bytes: int, unpacked_bytes: int) -> None:
-    """Refuse content that is far larger than its packed size, unlike measurements."""
-    if unpacked_bytes > max(LARGEST_UNPACKED_BYTES, MOST_UNPACKED * packed_bytes):
-        raise ValueError(f"{packed_bytes} bytes would become more than {unpacked_bytes >> 20} MiB: unpack it by hand")
-
-
 def call_in_process(module: str, name: str, *arguments: Any, **options: Any) -> Any:
-    """
-    Call a function in a separate process, because a damaged file may end its process.
-
-    :param module: module of the function
-    :param name: its name
-    :param arguments: its arguments, which need literals; as do ``options``. Its result must be picklable
-    :raises ValueError: with the last line of the process, or its exit status
-    """
+    """Call a function of literals in a separate process, because a damaged file may end its process."""
     code = f"import sys; sys.path[:] = {sys.path!r}\nimport pickle, {module}\n"
     code += f"pickle.dump({module}.{name}(*{arguments!r}, **{options!r}), sys.stdout.buffer)"
     process = subprocess.run([sys.executable, "-c", code], stdin=subprocess.DEVNULL, capture_output=True)

@@ -73,11 +73,6 @@ class Load(KnownLoad):
             raise ValueError(f"time_s must be at least 0, got {time[~(time >= 0.0)][0]:g}")
         return np.asarray(self.value[np.searchsorted(self.start_s, time, side="right") - 1])
 
-    def on_grid(self, time_s: FloatArray) -> FloatArray:
-        """Return the load at ascending times, many times faster than a call, by looking up segments instead of times."""
-        bounds = np.append(np.searchsorted(time_s, self.start_s), len(time_s))
-        return np.repeat(self.value, np.diff(bounds))
-
     @property
     def until_s(self) -> float:  # type: ignore[override]
         """After this time the load never discharges a cell, s."""
@@ -135,11 +130,9 @@ class Cycle(KnownLoad):
 
 @dataclass(frozen=True, eq=False)
 class _Spliced(KnownLoad):
-    """
-    Blocks of a series of values, one after the other, repeated after the last block. A block that reaches the end of the
-    series continues at its start. No array holds a day of values, because a forecast has a thousand of these loads.
-    """
+    """Blocks of a series of values, one after the other, repeated after the last block; the series is a circle."""
 
+    # no array holds a day of values, because a forecast has a thousand of these loads
     value: FloatArray  # one for each ``dt_s``
     start: IntArray  # start of each block in the series
     length: int  # of a block, in values
@@ -193,10 +186,7 @@ LoadToCome = float | KnownLoad | RandomLoad | Callable[[FloatArray], ArrayLike]
 
 
 def known_load(load: Any, unit: LoadUnit) -> KnownLoad:
-    """
-    Convert an argument to a load: a load of this module, a number, or a function of time in s that takes an array; ``unit`` is
-    that of a number or a function.
-    """
+    """Convert a load, a number or a function of time in s that takes an array; ``unit`` is that of a number or a function."""
     if isinstance(load, KnownLoad):
         return load
     if callable(load):
@@ -291,10 +281,7 @@ class RandomWalk(RandomLoad):
 
 
 def steadier_unit(record: Record) -> LoadUnit:
-    """
-    Return the unit that the consumer controls: current or power, whichever drifts less between switches while the voltage
-    falls.
-    """
+    """Return the unit that the consumer controls: what drifts less between switches while the voltage falls."""
     current_A = np.asarray(record.current_A)
     stretches, is_loaded = np.split(np.arange(len(current_A)), switches(current_A) + 1), is_load(current_A)
     drift = {"current": 0.0, "power": 0.0}

@@ -47,8 +47,6 @@ COLOUR_OF: Mapping[str, str] = {
     "measured": "0.5",
     "true": "0.25",
 }
-#: Labels of the axes of parameters.
-LABELS = {name: parameter.label for name, parameter in PARAMETERS.items()}
 
 # Title and scale of the axis of each panel of a life, in units of a lab. A figure has one of both resistances.
 _LIFE_COLUMNS = {
@@ -112,9 +110,9 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
         upper.scatter(true, inferred, c=table["load"], s=5, cmap="viridis", zorder=3)
         upper.set_title(f"{name}\nMAPE {mape.mean():.3g} %, worst {mape.max():.3g} %", fontsize=10)
         points = lower.scatter(true, mape, c=table["load"], s=3, cmap="viridis")
-        lower.set(yscale="log", xlabel=f"true {LABELS[parameter]}")
+        lower.set(yscale="log", xlabel=f"true {PARAMETERS[parameter].label}")
         lower.grid(alpha=0.25)
-    panels[0, 0].set_ylabel(f"inferred {LABELS[parameter]}")
+    panels[0, 0].set_ylabel(f"inferred {PARAMETERS[parameter].label}")
     panels[1, 0].set_ylabel("MAPE of a discharge (%)")
     figure.align_ylabels(panels[:, 0])
     figure.colorbar(points, ax=panels.ravel().tolist(), label="mean load (W)")
@@ -122,11 +120,8 @@ def plot_true_against_inferred(scores: Mapping[str, pd.DataFrame], parameter: st
 
 
 def coloured(items: Iterable[Item], variants_alike: bool = False) -> Iterator[tuple[str, Item]]:
-    """
-    Things to draw side by side, names or tuples that start with one, each after its colour. The first with a name of
-    :data:`COLOUR_OF` has its colour, or all have it that are told apart by something else; the others have those of
-    :data:`COLOURS` that are left, which come again when they are used up.
-    """
+    """Yield a colour for each thing, a name or a tuple that starts with one: that of its name, or else one of those left."""
+    # of things with one name the first has its colour, unless variants_alike
     item_list = list(items)
     own_colours = [_own_colour(item) for item in item_list]
     free = [colour for colour in COLOURS if colour not in own_colours]
@@ -146,10 +141,7 @@ def _own_colour(item: object) -> str | None:
 
 
 def draw_over_seeds(axes: Axes, x: ArrayLike, scores: ArrayLike, colour: str, label: str, **style: Any) -> None:
-    """
-    Draw the interquartile mean of scores, one row a seed, with a band of its 95 % interval where there are several seeds
-    (:func:`battery_env.evaluation.over_seeds`).
-    """
+    """Draw the interquartile mean of scores, one row a seed, with a band of its 95 % interval if there are several."""
     mean, low, high = over_seeds(scores)
     axes.plot(x, mean, color=colour, label=label, **{"lw": 1.4, **style})
     if not np.isnan(low).all():

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from battery_env.electrochemistry import FloatArray, Trajectory
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import Trajectory
 
 
 @dataclass(frozen=True)
@@ -85,12 +85,7 @@ class RandomSensorErrors:
 
     def draw_noise_V(self, rng: np.random.Generator) -> float:
         """Draw the standard deviation of the noise of one discharge, V; without noise use no random number."""
-        return float(np.exp(rng.uniform(*self._log_noise))) if self.noise_V[1] > 0.0 else 0.0
-
-    @cached_property
-    def _log_noise(self) -> tuple[float, float]:
-        least, greatest = np.log(self.noise_V).tolist()
-        return least, greatest
+        return float(np.exp(rng.uniform(*np.log(self.noise_V)))) if self.noise_V[1] > 0.0 else 0.0
 
     def draw_biases(self, rng: np.random.Generator, noise_V: float) -> SensorErrors:
         """Draw the errors of one discharge with this noise, V; a bound of 0 uses no random number."""

@@ -31,7 +31,7 @@ from battery_env.electrochemistry import (
 from battery_env.electrochemistry.aging_path import EQUILIBRIUM_SIZE, AgingPath
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.kernels import roll_out
-from battery_env.files import npz_path, read_npz, replacing
+from battery_env.files import read_npz, replacing
 from battery_env.loads import Load, LoadSampler, constant
 from battery_env.parameters import Q_MOBILE, R_O, check_parameters
 
@@ -143,9 +143,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :raises ValueError: for values out of range
         """
         names = aged_parameters(parameters)
-        n, seed = check_whole_number("n", n), check_whole_number("seed", seed)
-        if n < 1 or seed < 0:
-            raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
+        n, seed = check_whole_number("n", n, 1), check_whole_number("seed", seed, 0)
         if not isinstance(mismatch, Real) or not 0.0 <= mismatch <= MISMATCH_LIMIT:
             raise ValueError(f"mismatch is a relative standard deviation within 0 .. {MISMATCH_LIMIT:g}, got {mismatch!r}")
         q_range, r_range = check_range("q_mobile_range", q_mobile_range), check_range("r_o_range", r_o_range)
@@ -276,8 +274,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
             use a :meth:`subset` instead
         :raises ValueError: for no trajectories, or trajectories that differ otherwise
         """
-        if isinstance(trajectories, Trajectory):
-            raise TypeError("trajectories must be a list of them, got one Trajectory")
         for trajectory in trajectories:
             if not isinstance(trajectory, Trajectory):
                 raise TypeError(f"trajectories must hold Trajectory, got {type(trajectory).__name__}")
@@ -344,7 +340,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         voltage, current = columns
         state[0] = self.checkpoint[self.checkpoint_start[n]]
         # no cut-off, because trajectories of a user may have samples below it
-        q, r, is_power, packed = self.q_mobile[n], self.r_o[n], self.load_unit == "power", self.packed(np.array([n]))
+        packed = _packed(self.cell, self.factors[[n]], self.equilibrium_V[[n]])
+        q, r, is_power = self.q_mobile[n], self.r_o[n], self.load_unit == "power"
         if roll_out(load, q, r, self.dt_s, -np.inf, is_power, self.thermal, packed, state, columns) < samples:
             raise ValueError(f"trajectory {n} cannot be simulated again: it was made with another load or other constants")
         return Trajectory(
@@ -375,10 +372,6 @@ class TrajectoryDataset(Sequence[Trajectory]):
         cell = self.cell.replace(q_mobile=float(self.q_mobile[n]), r_o=float(self.r_o[n]), **true)
         return with_equilibrium(cell, self.equilibrium_V[n]) if self.equilibrium_V[n].any() else cell
 
-    def packed(self, index: IntArray) -> PackedConstants:
-        """Return the true constants of trajectories of one equilibrium voltage: one row a cell, or one row of ``cell``."""
-        return _packed(self.cell, self.factors[index], self.equilibrium_V[index])
-
     def states_at(self, index: IntArray, sample: IntArray) -> FloatArray:
         """Return the true states of trajectories at samples, counted from full charge: shape (m, 8)."""
         if len(index) > 1 and self.equilibrium_V.any():
@@ -395,7 +388,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
             self.dt_s,
             self.load_unit,
             self.thermal,
-            self.packed(index),
+            _packed(self.cell, self.factors[index], self.equilibrium_V[index]),
         )
         return state
 
@@ -426,7 +419,7 @@ class TrajectoryDataset(Sequence[Trajectory]):
         """
         if not isinstance(test, Real) or not 0.0 < test < 1.0:
             raise ValueError(f"test must be greater than 0 and less than 1, got {test!r}")
-        rng, count = np.random.default_rng(check_whole_number("seed", seed)), round(test * len(self))
+        rng, count = np.random.default_rng(check_whole_number("seed", seed, 0)), round(test * len(self))
         if by not in ("trajectory", "parameter"):
             raise ValueError(f"by must be 'trajectory' or 'parameter', got {by!r}")
         order = rng.permutation(len(self)) if by == "trajectory" else np.lexsort((self.r_o, -self.q_mobile))[::-1]
@@ -442,7 +435,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
         :raises FileExistsError: if the file exists already
         """
         settings = {name: getattr(self, name) for name in _SETTINGS} | {"cell": asdict(self.cell)}
-        target, metadata = npz_path(path), json.dumps({**settings, "kind": _KIND, "format": _FORMAT})
+        target, metadata = Path(path), json.dumps({**settings, "kind": _KIND, "format": _FORMAT})
+        target = target.with_name(f"{target.name.removesuffix('.npz')}.npz")
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
         with replacing(target, new=True) as temporary:
             np.savez_compressed(temporary, metadata=np.array(metadata), **arrays)
@@ -473,6 +467,7 @@ def _checkpoints(samples: IntArray) -> IntArray:
 
 
 def _packed(cell: CellParameters, factors: FloatArray, equilibrium_V: FloatArray) -> PackedConstants:
+    """Return the true constants of cells of one equilibrium voltage: one row a cell, or one row of ``cell``."""
     if equilibrium_V.any():
         if (equilibrium_V != equilibrium_V[0]).any():
             raise ValueError("the cells have equilibrium voltages of their own, and only one at a time can be followed")
@@ -516,7 +511,7 @@ def _simulate(
     # one buffer for all cells
     state, columns = np.empty((len(day) + 1, STATE_SIZE)), np.empty((2, len(day)))
     for k, load in enumerate(loads):
-        profile = load.on_grid(day)
+        profile = load(day)
         cells = np.flatnonzero(load_index == k)
         for n in cells.tolist():
             state[0] = start[n]

@@ -31,8 +31,8 @@ from battery_env.electrochemistry import NEW_CELL, UNCERTAIN_CONSTANTS
 from battery_env.estimators import ClosedForm, Estimator, LeastSquares
 from battery_env.evaluation import evaluate
 from battery_env.loads import RandomPiecewise
-from battery_env.parameters import PARAMETER_NAMES
-from battery_env.plotting import LABELS, coloured, new_figure
+from battery_env.parameters import PARAMETER_NAMES, PARAMETERS
+from battery_env.plotting import coloured, new_figure
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.policies.pretrained import pretrained_card
 from battery_env.sensors import RandomSensorErrors, SensorErrors
@@ -402,7 +402,7 @@ def plot(results: pd.DataFrame, labels: Sequence[str]) -> Figure:
             axes.axhline(y, color="0.8", lw=0.8)
         y += 1
     for axes, parameter in zip(panels, PARAMETER_NAMES, strict=True):
-        axes.set(xscale="log", xlabel="error in the second half (%)", title=LABELS[parameter].split(" (")[0])
+        axes.set(xscale="log", xlabel="error in the second half (%)", title=PARAMETERS[parameter].symbol)
         axes.grid(axis="x", alpha=0.25)
     panels[0].set_yticks(list(ticks), ticks.values(), fontsize=8)
     panels[0].set_ylim(y - 1, -1)

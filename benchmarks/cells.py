@@ -29,7 +29,8 @@ from battery_env.estimates import Estimate
 from battery_env.estimators import CellFit, Estimator, LeastSquares, fit_cell
 from battery_env.estimators.cell_fit import UNFITTED_MISMATCH_V
 from battery_env.lab.settings import Settings
-from battery_env.plotting import COLOUR_OF, COLOURS, LABELS, new_figure, plot_cell_fit
+from battery_env.parameters import PARAMETERS
+from battery_env.plotting import COLOUR_OF, COLOURS, new_figure, plot_cell_fit
 from battery_env.records.discharge import BUNDLED_CELLS, NASA_CITATION, Discharge, load_nasa_discharges
 from battery_env.records.model import RecordModel
 from benchmarks.study import (
@@ -221,7 +222,7 @@ def plot_life(whole: pd.DataFrame) -> Figure:
         part = whole[whole["cell"] == cell]
         for axes, name, unit, scale in ((upper, "q_mobile", "C", 1.0 / 3600.0), (lower, "r_o", "ohm", 1e3)):
             value, sd = scale * part[f"{name}_{unit}"], scale * part[f"sd_{name}_{unit}"]
-            symbol = LABELS[name].split(" (")[0]
+            symbol = PARAMETERS[name].symbol
             axes.fill_between(part["cycle"], value - sd, value + sd, color=fitted, alpha=0.15, lw=0, label="± 1 sd, common")
             axes.plot(part["cycle"], value, color=fitted, lw=1.6, label=f"{symbol}, least squares")
             axes.grid(alpha=0.25)

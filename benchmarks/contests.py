@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from battery_env.estimators import ClosedForm, Estimator, LeastSquares
 from battery_env.evaluation import evaluate, summarize
+from battery_env.parameters import PARAMETERS
 from battery_env.plotting import (
-    LABELS,
     coloured,
     draw_over_seeds,
     new_figure,
@@ -339,7 +339,7 @@ def plot_ranks(scores: pd.DataFrame, parameters: Sequence[str]) -> Figure:
                 seeds = [errors.to_numpy() for _, errors in group.groupby("seed", dropna=False)[column]]
                 shares = [100.0 * np.mean(errors[:, None] <= limits, axis=0) for errors in seeds]
                 draw_over_seeds(axes, limits, shares, colour, str(calibrator))
-            axes.set(xscale="log", title=f"{LABELS[name].split(' (')[0]}, {sensor}")
+            axes.set(xscale="log", title=f"{PARAMETERS[name].symbol}, {sensor}")
             axes.title.set_fontsize(9)
             axes.grid(which="both", alpha=0.2)
     for axes in panels[-1]:

@@ -101,7 +101,7 @@ def last_curve(last: Record, seen: Record, load: Load) -> float:
     resistance_ohm = max(float(lower_V @ more_A) / float(more_A @ more_A + 4e-4 * len(more_A)), 0.0)
     since_s = np.arange(_LONGEST_S)
     expected_V = np.interp(seen_C[-1] + load.drawn(since_s), curve_C, curve_V)
-    expected_V -= resistance_ohm * (load.on_grid(since_s) - usual_A)
+    expected_V -= resistance_ohm * (load(since_s) - usual_A)
     return float(seen.time_s[-1] + np.argmax(expected_V <= CUT_OFF_V))
 
 
@@ -232,7 +232,7 @@ def life_table(lives: dict[str, Life], remaining: pd.DataFrame) -> pd.DataFrame:
     """The summary over cycles."""
     table = []
     for cell, life in lives.items():
-        expected = [life.after(n).next_q_mobile_C for n in range(1, len(life.table))]
+        expected = [life.after(n).later_q_mobile_C(1) for n in range(1, len(life.table))]
         mean_C, sd_C = np.array(expected).T
         q_C = life.table["q_mobile_C"].to_numpy()[1:]
         error = np.abs(q_C / mean_C - 1.0)

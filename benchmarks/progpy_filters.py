@@ -13,7 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib import rc_context
 
-from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, STATE_SIZE, FloatArray, initial_state
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import FULL_CHARGE_SHARES, NEW_CELL, QNB, STATE_SIZE, initial_state
 from battery_env.estimators.estimator import Estimate, EstimateTrace, Estimator, Record
 
 with rc_context():  # progpy changes the defaults of matplotlib

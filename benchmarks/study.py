@@ -12,6 +12,7 @@ import inspect
 import json
 import os
 import platform
+import secrets
 import shlex
 import sys
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -32,7 +33,7 @@ from tqdm import tqdm
 import battery_env
 import sb3_lac
 from battery_env.evaluation import over_seeds
-from battery_env.files import check_folder, rename_damaged, replacing
+from battery_env.files import check_folder, replacing
 from battery_env.lab.batch import interruptible, workers
 from battery_env.plotting import new_figure, save_figure
 
@@ -413,7 +414,8 @@ def recall(file: Path) -> dict[str, Any] | None:
         content = json.loads(file.read_text(encoding="utf-8"))
         return {**content, "versions": content["versions"]}
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        print(f"{file} is damaged ({error!r}): it is kept as {rename_damaged(file).name}, and made again", file=sys.stderr)
+        damaged = file.replace(file.with_name(f"{file.name}.{secrets.token_hex(4)}.damaged"))
+        print(f"{file} is damaged ({error!r}): it is kept as {damaged.name}, and made again", file=sys.stderr)
         return None
 
 

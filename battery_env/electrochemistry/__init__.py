@@ -26,7 +26,6 @@ not to be confused with the libraries' ``qMax = qMobile / 0.6``), and ``r_o``, t
 One compiled kernel (numba) serves one cell and a million: every public function broadcasts over leading axes.
 """
 
-from battery_env.arrays import FloatArray as FloatArray
 from battery_env.checks import LoadUnit as LoadUnit
 from battery_env.electrochemistry.cell import FULL_CHARGE_SHARES as FULL_CHARGE_SHARES
 from battery_env.electrochemistry.cell import NEW_CELL as NEW_CELL
@@ -35,7 +34,6 @@ from battery_env.electrochemistry.cell import QNS as QNS
 from battery_env.electrochemistry.cell import QPS as QPS
 from battery_env.electrochemistry.cell import STATE_NAMES as STATE_NAMES
 from battery_env.electrochemistry.cell import STATE_SIZE as STATE_SIZE
-from battery_env.electrochemistry.cell import TB as TB
 from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS as UNCERTAIN_CONSTANTS
 from battery_env.electrochemistry.cell import VO as VO
 from battery_env.electrochemistry.cell import VSP as VSP

@@ -13,7 +13,7 @@ import numpy as np
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import check_positive, check_whole_number
-from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS, CellParameters, check_cell
+from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import ERRORS_PER_DISCHARGE
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
@@ -88,9 +88,8 @@ class AgingPath:
     mismatch_V: float
 
     def __post_init__(self) -> None:
-        if self.cell is None:
-            raise TypeError("cell must be CellParameters, got None")
-        check_cell(self.cell)
+        if not isinstance(self.cell, CellParameters):
+            raise TypeError(f"cell must be CellParameters, got {self.cell!r}")
         check_positive("mismatch_V", self.mismatch_V)
         if not self.lives:
             raise ValueError("a path is of at least one life")
@@ -111,9 +110,7 @@ class AgingPath:
         :return: the cells
         :raises ValueError: for no cells, or a negative seed
         """
-        n, seed = check_whole_number("n", n), check_whole_number("seed", seed)
-        if n < 1 or seed < 0:
-            raise ValueError(f"n must be at least 1 and seed at least 0, got n = {n} and seed = {seed}")
+        n, seed = check_whole_number("n", n, 1), check_whole_number("seed", seed, 0)
         rng = np.random.default_rng(seed)
         low, high = -PATH_EXTRAPOLATION_SHARE, 1.0 + PATH_EXTRAPOLATION_SHARE
         life, place = rng.integers(len(self.lives), size=n), rng.uniform(low, high, size=n)
@@ -236,7 +233,6 @@ def cell_with(cell: CellParameters, constants: Mapping[str, float] | None) -> Ce
 
 def _interpolate(rows: FloatArray, place: FloatArray) -> FloatArray:
     """Return values at places of a life: linear between two ages, and extrapolated with the slopes at its ends."""
-
     last = len(rows) - 1
     position = np.clip(place, 0.0, 1.0) * last
     lower = np.minimum(position.astype(np.int64), last - 1)

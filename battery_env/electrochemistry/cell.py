@@ -69,11 +69,8 @@ class PackedConstants(NamedTuple):
 
 
 def _redlich_kister_polynomial(coefficients: tuple[float, ...], faraday: float) -> FloatArray:
-    """
-    Collapse the Redlich-Kister sum of the equilibrium potential into one polynomial in y = 2x - 1.
-
-    Term k is A_k/F * ((1 + k/2) * y^(k+1) - (k/2) * y^(k-1)); unlike the sum it has no singularity at x = 0.5.
-    """
+    """Return the Redlich-Kister sum of the equilibrium potential as a polynomial in y = 2x - 1, without its singularity."""
+    # term k is A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
     polynomial = np.zeros(POLYNOMIAL_SIZE)
     for k, coefficient in enumerate(coefficients):
         polynomial[k + 1] += coefficient / faraday * (1.0 + k / 2.0)
@@ -238,10 +235,7 @@ class CellParameters:
         )
 
     def packed_with(self, factors: FloatArray) -> PackedConstants:
-        """
-        Return the constants of many cells, one row each: this cell's, ``UNCERTAIN_CONSTANTS`` multiplied by ``factors``, shape
-        (n, 4).
-        """
+        """Return one row a cell: this cell's constants, ``UNCERTAIN_CONSTANTS`` multiplied by ``factors``, shape (n, 4)."""
         packed = self.packed
         constants = np.repeat(packed.constants, len(factors), axis=0)
         kn, t_diffusion, to, tsn = factors.T

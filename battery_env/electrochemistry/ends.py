@@ -36,7 +36,6 @@ SURPLUS_SHARE = 0.01
 _CHUNK_STEPS = 512
 # Rows of the progress of cells: parameters and errors, sum of currents, last current and voltage, and the end of discharge.
 _Q, _R_O, _ERROR, _DRIFT, _FIRST_SOC, _LAST_STEP, _SUM_A, _LAST_A, _LAST_V, _END, _END_SOC = range(11)
-_INITIAL_PROGRESS = (0.0, np.nan, np.nan, np.inf, np.nan)
 
 
 class Model(Protocol):
@@ -111,15 +110,10 @@ def simulate_to_cut_off(
     model: Model,
     loads: Sequence[FutureLoad],
     cut_off_V: float,
-    every_s: float | None = None,
-    surplus_share: float = SURPLUS_SHARE,
+    every_s: float | None = None,  # between samples of the course; None: no course
+    surplus_share: float = SURPLUS_SHARE,  # a load that charges a cell further beyond full is refused
 ) -> EndsOfDischarge:
-    """
-    Discharge cells to the cut-off, for a week at most, under loads in one unit, one for all cells or one a cell.
-
-    The course of the voltage has a sample every ``every_s``, or none. The function refuses a load that charges a cell beyond
-    full by more than ``surplus_share`` of its charge.
-    """
+    """Discharge cells to the cut-off, for a week at most, under loads in one unit, one for all cells or one a cell."""
     count, dt_s, power = len(cells.q_mobile), model.dt_s, loads[0].unit == "power"
     end_step = np.broadcast_to(np.ceil(np.minimum([load.until_s for load in loads], LONGEST_S) / dt_s - 1e-9), count)
     progress = _initial_progress(cells, end_step)
@@ -187,7 +181,7 @@ class _Run(NamedTuple):
 def _initial_progress(cells: Cells, end_step: FloatArray) -> FloatArray:
     """Return the progress of cells before the first step."""
     initial = (cells.q_mobile, cells.r_o, cells.error_V, cells.drift_V, cells.soc, end_step)
-    return np.vstack([*initial, np.repeat(np.array(_INITIAL_PROGRESS)[:, None], len(end_step), axis=1)])
+    return np.vstack([*initial, *(np.full_like(end_step, value) for value in (0.0, np.nan, np.nan, np.inf, np.nan))])
 
 
 @compiled

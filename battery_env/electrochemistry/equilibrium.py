@@ -22,8 +22,7 @@ def with_equilibrium(cell: CellParameters, coefficients_V: Sequence[float] | Flo
     Add Legendre polynomials 0, 1, ... with these coefficients, V, exactly to the equilibrium voltage of a cell: by ``U0p`` and
     ``Ap``. Their variable spans the mole fractions of the positive electrode in a discharge.
     """
-    # the sum as a polynomial in y = 2x - 1, from the highest power down: term k of the Redlich-Kister sum is
-    # A_k / F * ((1 + k / 2) * y^(k + 1) - (k / 2) * y^(k - 1))
+    # the sum as a polynomial in y = 2x - 1, from the highest power down, as terms of the Redlich-Kister sum
     powers = np.asarray(coefficients_V, dtype=np.float64) @ _powers(len(coefficients_V))
     terms = np.zeros(max(len(cell.Ap), len(powers) - 1))
     for k in range(len(powers) - 2, -1, -1):

@@ -190,6 +190,12 @@ def mole_fraction(surface_charge: float, q: float, extended: bool, constants: Fl
 
 
 @inlined
+def cell_fractions(x: FloatArray, n: int, q: float, extended: bool, constants: FloatArray) -> tuple[float, float]:
+    # mole fractions at both surfaces of row n of x
+    return mole_fraction(x[n, QNS], q, extended, constants), mole_fraction(x[n, QPS], q, extended, constants)
+
+
+@inlined
 def equilibrium_voltage(
     xn: float, xp: float, tb: float, constants: FloatArray, poly_n: FloatArray, poly_p: FloatArray
 ) -> float:
@@ -208,11 +214,10 @@ def nominal_overpotentials(i: float, xn: float, xp: float, tb: float, constants:
 def cell_voltage(x: FloatArray, n: int, q: float, extended: bool, packed: PackedConstants) -> float:
     # V = Vep(xp) - Ven(xn) - Vo - Vsn - Vsp
     constants, poly_n, poly_p = packed
-    share = constants[0, FRACTION_PER_SHARE] / q
-    xn, xp = _fraction(share, x[n, QNS], extended), _fraction(share, x[n, QPS], extended)
+    xn, xp = cell_fractions(x, n, q, extended, constants)
     if not _has_voltage(xn, xp):
         return np.nan
-    equilibrium = _equilibrium(xn, xp, x[n, TB], constants[0, R_OVER_F], constants[0, U0], poly_n, poly_p)
+    equilibrium = equilibrium_voltage(xn, xp, x[n, TB], constants, poly_n, poly_p)
     return equilibrium - x[n, VO] - x[n, VSN] - x[n, VSP]
 
 
@@ -230,8 +235,7 @@ def cell_step(
     constants: FloatArray,
 ) -> None:
     # One step of row n of x, into its row m, which may be the same
-    share = constants[0, FRACTION_PER_SHARE] / q
-    xn, xp = _fraction(share, x[n, QNS], extended), _fraction(share, x[n, QPS], extended)
+    xn, xp = cell_fractions(x, n, q, extended, constants)
     state = (x[n, TB], x[n, VO], x[n, VSN], x[n, VSP], x[n, QNB], x[n, QNS], x[n, QPB], x[n, QPS])
     k = (
         constants[0, BULK_RATE],

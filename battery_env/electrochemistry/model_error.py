@@ -11,12 +11,11 @@ from battery_env.compiled import compiled
 UNFITTED_ERROR_RATIO = 2.0
 #: Number of independent model errors in a whole discharge, in addition to a first one, by purpose:
 #:
-#: - ``forecast``: the residuals of whole discharges of B0005 lose their correlation at this rate
 #: - ``fit``: the residuals of a fit of the constants drift faster
 #: - ``path``: the error of a cell at its place along an aging path drifts faster too. Chosen on B0005 along the path of B0006
-ERRORS_PER_DISCHARGE: Mapping[str, float] = {"forecast": 1.0 / 0.15, "fit": 49.0, "path": 100.0}
-#: Correlation length of the model error in a forecast, as a share of ``q_mobile``.
-CORRELATION_SHARE = 1.0 / ERRORS_PER_DISCHARGE["forecast"]
+ERRORS_PER_DISCHARGE: Mapping[str, float] = {"fit": 49.0, "path": 100.0}
+#: Correlation length of the model error in a forecast, as a share of ``q_mobile``: that of the residuals of B0005.
+CORRELATION_SHARE = 0.15
 
 
 @compiled

@@ -5,7 +5,6 @@ A tangent is the derivative of a state. The state of a cell is the only row of `
 arrays. Its tangents ``dx`` have the shape (1, 2, 8) or (1, 8, 8), with rows in the order of ``TANGENT_NAMES``: with respect to
 ``q_mobile`` and ``r_o`` and, optionally, to the logarithms of ``RATE_CONSTANTS``. The charges are linear in ``q_mobile``, so
 that their tangents hold at any distance.
-
 """
 
 from __future__ import annotations
@@ -41,6 +40,7 @@ from battery_env.electrochemistry.cell import (
     PackedConstants,
 )
 from battery_env.electrochemistry.kernels import (
+    cell_fractions,
     cell_step,
     cell_voltage,
     diffusion,
@@ -96,12 +96,6 @@ def overpotential_slopes(i: float, xn: float, xp: float, tb: float, constants: F
 
 
 @inlined
-def _fractions(x: FloatArray, q: float, extended: bool, constants: FloatArray) -> tuple[float, float]:
-    # mole fractions at both surfaces
-    return mole_fraction(x[0, QNS], q, extended, constants), mole_fraction(x[0, QPS], q, extended, constants)
-
-
-@inlined
 def _fraction_tangents(dx: FloatArray, xn: float, xp: float, q: float, constants: FloatArray) -> tuple[float, float]:
     # derivatives of xn and xp with respect to q; xn and xp do not depend on r_o
     share = constants[0, FRACTION_PER_SHARE] / q
@@ -121,7 +115,7 @@ def _voltage_slopes(
 ) -> tuple[float, float, float, float, float]:
     # mole fractions at both surfaces, and the derivatives of the voltage by these and by the temperature
     constants, tb = packed.constants, x[0, TB]
-    xn, xp = _fractions(x, q, False, constants)
+    xn, xp = cell_fractions(x, 0, q, False, constants)
     v_xn, v_xp = equilibrium_slopes(xn, xp, tb, constants, derivatives)
     return xn, xp, v_xn, v_xp, constants[0, R_OVER_F] * nernst_logarithm(xn, xp) if thermal else 0.0
 
@@ -205,7 +199,7 @@ def step_with_tangents(
 ) -> None:
     # One step of the state and of its tangents with respect to q and r_o, in place
     tb = x[0, TB]
-    xn, xp = _fractions(x, q, extended, constants)
+    xn, xp = cell_fractions(x, 0, q, extended, constants)
     vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants)
     vsn_tb, vsp_tb = 0.0, 0.0
     if thermal:
@@ -226,7 +220,7 @@ def _step_rate_tangents(
 ) -> None:
     # One step of the tangents with respect to the logarithms of RATE_CONSTANTS, in place; the state stays as it is
     tb = x[0, TB]
-    xn, xp = _fractions(x, q, False, constants)
+    xn, xp = cell_fractions(x, 0, q, False, constants)
     vsn_xn, vsp_xp = overpotential_slopes(i, xn, xp, tb, constants)
     vsn, vsp = nominal_overpotentials(i, xn, xp, tb, constants)
     vsn_tb, vsp_tb = (vsn / tb, vsp / tb) if thermal else (0.0, 0.0)

@@ -30,7 +30,7 @@ import pandas as pd
 from battery_env.estimates.findings import codes_of, findings_of
 from battery_env.files import check_folder, locked, replacing
 from battery_env.lab.calibrate import calibrate
-from battery_env.lab.readers.columns import FileFormat
+from battery_env.lab.readers.columns import FileFormat, few_of
 from battery_env.lab.report import METHOD_NAMES, Calibration, title_of
 from battery_env.lab.settings import Settings
 from battery_env.lab.sources import (
@@ -39,7 +39,6 @@ from battery_env.lab.sources import (
     TABLE,
     VOLTAGE,
     Source,
-    few_of,
     find_sources,
     is_bundled,
     is_result,

@@ -51,7 +51,6 @@ from battery_env.records.model import ModelError, RecordModel, VoltageForecast
 # A record of more samples than this is averaged over the time step of the model, or over longer steps if the record has more
 # than this many of them: the model has no use for samples in between.
 _MANY_SAMPLES = 100_000
-_MODEL_STEP_S = 1.0
 # A charge after the cut-off is a warning above this share of the charge before.
 _AFTER_SHARE = 0.2
 # A search has ended at a bound if its result is within this share of the bound.
@@ -109,7 +108,7 @@ def calibrate(
     names = (SettingsOptions if isinstance(source, Discharge) else Options).__annotations__
     check_options("calibrate", options, names)
     of_file = {name: options.pop(name) for name in options.keys() - SettingsOptions.__annotations__.keys()}
-    settings = (Settings() if settings is None else settings).but(**options)
+    settings = replace(Settings() if settings is None else settings, **options)
     if isinstance(source, Discharge):
         return calibrated(source, settings)
     file_format = FileFormat(**of_file | {"tester": find_tester(of_file.get("tester"))})
@@ -176,13 +175,13 @@ class Fit(NamedTuple):
             )
 
 
-def calibrated(discharge: Discharge, settings: Settings, samples: int = 1000) -> Calibration:
-    """Calibrate one discharge; if it is in progress, predict its end if possible, with so many samples."""
+def calibrated(discharge: Discharge, settings: Settings) -> Calibration:
+    """Calibrate one discharge; if it is in progress, predict its end if possible."""
     loaded = cut(discharge, settings)
     fit, end = estimate(loaded), None
     if loaded.in_progress and np.isfinite(fit.reported.q_mobile):  # a cell of unknown size has no end
         with suppress(ValueError):
-            end = predict(loaded, fit, samples=samples)
+            end = predict(loaded, fit)
     return calibration_of(loaded, fit, end)
 
 
@@ -192,7 +191,7 @@ def cut(discharge: Discharge, settings: Settings) -> LoadedPart:
     eod_time_s, part = discharge.eod_time_s(resolved.cut_off_V), discharge.loaded_part(resolved.cut_off_V)
     record = part
     if len(part.time_s) > _MANY_SAMPLES:
-        record = part.averaged(max(_MODEL_STEP_S, float(part.time_s[-1] - part.time_s[0]) / _MANY_SAMPLES))
+        record = part.averaged(max(RecordModel().dt_s, float(part.time_s[-1] - part.time_s[0]) / _MANY_SAMPLES))
     constants = settings.constants_in_progress if np.isnan(eod_time_s) else settings.constants
     cell = _at_the_temperature(constants, record, settings)
     if settings.initial_soc == "rest":
@@ -355,10 +354,7 @@ def _charge_after_C(discharge: Discharge, eod_time_s: float) -> float:
 
 
 def _at_the_temperature(cell: CellParameters, record: Discharge, settings: Settings) -> CellParameters:
-    """
-    Return constants at the temperature measured at the start of the load, or else at the ambient temperature of the record.
-    Constants of a path, and those of a policy, hold at one temperature.
-    """
+    """Return constants at the temperature at the start of the load; those of a path and of a policy hold at one alone."""
     ambient_C = record.meta.get("ambient_temperature_C")
     if record.temperature_C is not None:
         ambient_C = record.temperature_C[0]
@@ -461,10 +457,7 @@ def _charge(loaded: LoadedPart, fit: Fit, end: Forecast | None) -> dict[str, Any
 
 
 def _is_all_logged(loaded: LoadedPart, evidence: Evidence) -> bool:
-    """
-    Return whether the record has all charge drawn: the first voltage is not below that of the charge at the start, no sensor
-    fails, and the voltage confirms the charge of each gap.
-    """
+    """Return whether the record has all charge drawn: no less at its start, by the voltage, no fault and no doubtful gap."""
     # a charge with a tapered current fills any cell, at any voltage at rest
     charge = loaded.record.history.charge
     is_lower = evidence.first_V < evidence.start_V and not (charge and charge.is_tapered)

@@ -27,12 +27,12 @@ from battery_env.estimators.search import spread_over
 from battery_env.files import check_new, finite_or_none, replacing
 from battery_env.lab.batch import VERSION, Outcome, Results, calibrate_all, interruptible, workers
 from battery_env.lab.page_server import serve
-from battery_env.lab.readers.columns import FileFormat, recognise
+from battery_env.lab.readers.columns import FileFormat, few_of, recognise
 from battery_env.lab.readers.tables import open_file
 from battery_env.lab.readers.testers import find_tester, tester_file
 from battery_env.lab.report import Calibration, change_of, line_of, text_of
 from battery_env.lab.settings import METHODS, Settings, SettingsOptions
-from battery_env.lab.sources import VOLTAGE, Source, few_of, find_sources, read_source
+from battery_env.lab.sources import VOLTAGE, Source, find_sources, read_source
 from battery_env.loads import constant
 from battery_env.records import CUT_OFF_V
 from battery_env.records.discharge import Discharge

@@ -260,12 +260,11 @@ def forecast(
 
 def _check_arguments(mismatch_V: float, cut_off_V: float, nominal_Ah: float | None, samples: int, seed: int) -> None:
     check_not_negative(mismatch_V=mismatch_V)
-    if not 0.0 < cut_off_V < np.inf:
-        raise ValueError(f"cut_off_V must be a positive voltage in V, got {cut_off_V!r}")
+    check_positive("cut_off_V", cut_off_V)
     if nominal_Ah is not None:
         check_positive("nominal_Ah", nominal_Ah)
-    if check_whole_number("samples", samples) < 1 or check_whole_number("seed", seed) < 0:
-        raise ValueError(f"samples must be at least 1 and seed at least 0, got {samples!r} and {seed!r}")
+    check_whole_number("samples", samples, 1)
+    check_whole_number("seed", seed, 0)
 
 
 def _notes(estimate: Estimate, record: Samples, goes_on_varied: bool) -> list[str]:
@@ -379,10 +378,7 @@ def _cells_at_the_end(
     mismatch_V: float,
     rng: np.random.Generator,
 ) -> tuple[Cells, FloatArray]:
-    """
-    Simulate cells with drawn parameters along a record, and draw their model errors from the last measured voltages. Return
-    also the last voltage of the model, NaN if the cell was empty before.
-    """
+    """Return cells with drawn parameters and errors at the end of a record, and their last voltage (NaN: empty)."""
     steps, count = len(current_A) - 1, len(parameters[0])
     measured_V = np.interp(record.time_s[0] + model.dt_s * np.arange(steps + 1), record.time_s, record.voltage_V)
     last = slice(min(int((1.0 - RECENT_SHARE) * steps), steps - 1) + 1, None)

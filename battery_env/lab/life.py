@@ -143,11 +143,6 @@ class Life:
         difference = (share[1:] - share[0]) / np.maximum(share[1:], share[0])
         return sqrt(0.5 * float(np.nansum(difference**2)))
 
-    @property
-    def next_q_mobile_C(self) -> tuple[float, float]:
-        """Mean and standard deviation of ``q_mobile`` in the next discharge, C."""
-        return self.later_q_mobile_C(1)
-
     def later_q_mobile_C(self, count: int) -> tuple[float, float]:
         """Mean and standard deviation of ``q_mobile`` so many discharges after the last one, C."""
         weights = np.array([1.0, count])
@@ -193,7 +188,7 @@ class Life:
         :return: that part of the life, with the sizes of step and noise that it shows
         :raises ValueError: for fewer discharges than one or more than there are, or if none of them is valid
         """
-        if not 1 <= check_whole_number("count", count) <= len(self.table):
+        if check_whole_number("count", count, 1) > len(self.table):
             raise ValueError(f"count must lie within 1 .. {len(self.table)}, got {count}")
         unchanged = {name: getattr(self, name) for name in ("sd_share", "usual_start", "cut_off_V", "alternatives")}
         return replace(life_of(self.table.iloc[:count]), model_errors=self.model_errors[:count], **unchanged)
@@ -300,8 +295,8 @@ def _track(discharges: Sequence[Discharge], cut_off_V: float, fixed: LeastSquare
                     "findings": (Finding.of(Reason.OTHER, message=str(error)),),
                 }
             )
-    texts = [{"reason": reason_of(row["findings"])} for row in rows]
-    life = life_of(pd.DataFrame([row | text for row, text in zip(rows, texts, strict=True)], columns=_COLUMNS))
+    table = pd.DataFrame(rows, columns=_COLUMNS)
+    life = life_of(table.assign(reason=[reason_of(each) for each in table["findings"]]))
     assert last_fit is not None  # a life without a valid discharge is refused
     estimate, alternatives = free.estimate_of(last_fit), last_fit.alternatives()
     sd_share = estimate.sd_q_mobile / estimate.q_mobile
@@ -383,31 +378,23 @@ def _model_error(fit: RecordFit, model: RecordModel, estimate: Estimate, end_s: 
 
 
 def life_of(table: pd.DataFrame, doubt_share: ArrayLike = 0.0) -> Life:
-    """
-    Follow ``q_mobile`` over the rows of a table, as :class:`Life` has it.
-
-    :param table: one row per discharge
-    :param doubt_share: further standard deviations of the estimates, as shares of ``q_mobile``, shape (discharges,)
-    """
+    """Follow ``q_mobile`` over the rows of a table; ``doubt_share``: further relative standard deviations of the estimates."""
     valid = table["valid"].to_numpy(dtype=np.bool_)
     if not valid.any():
         raise ValueError(f"no discharge determines q_mobile. {_most_common(table['findings'])}")
     readings, steps = np.log(table["q_mobile_C"].to_numpy()), _steps_between(table["cycle"])
-    first = int(np.flatnonzero(valid)[0])
     centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
-    expected = np.full((len(readings), 2), np.nan)
-    state, covariance = np.zeros(2), np.zeros((2, 2))
     doubts = np.broadcast_to(np.asarray(doubt_share, dtype=np.float64), len(readings)).copy()
 
-    def surprise(logarithms: FloatArray) -> float:
+    def filtered(logarithms: FloatArray) -> Any:
         step, noise = np.exp(np.clip(logarithms, -15.0, 0.0))
-        out = _filtered(
-            readings, steps, valid, first, step, np.hypot(noise, doubts), PRIOR_DRIFT_SD_SHARE, expected, state, covariance
-        )
-        return float(out + 0.5 * ((logarithms - centre) ** 2).sum())
+        return _filtered(readings, steps, valid, step, np.hypot(noise, doubts))
+
+    def surprise(logarithms: FloatArray) -> float:
+        return float(filtered(logarithms)[0] + 0.5 * ((logarithms - centre) ** 2).sum())
 
     best = minimize(surprise, centre, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4}).x
-    surprise(best)
+    _, expected, state, covariance = filtered(best)
     step, noise = np.exp(best)
     mean_C = np.exp(expected[:, 0])
     table = table.assign(expected_q_mobile_C=mean_C, expected_sd_C=mean_C * np.sqrt(expected[:, 1]))
@@ -429,22 +416,14 @@ def _most_common(findings: pd.Series) -> str:
 
 @compiled
 def _filtered(
-    readings: FloatArray,
-    steps: FloatArray,
-    valid: BoolArray,
-    first: int,
-    step: float,
-    noise: FloatArray,
-    drift_sd: float,
-    expected: FloatArray,
-    state: FloatArray,
-    covariance: FloatArray,
-) -> float:
-    # Kalman's recursions. Returns minus the log likelihood; fills the prediction of each reading (mean and variance of the
-    # level) and the state after the last reading
+    readings: FloatArray, steps: FloatArray, valid: BoolArray, step: float, noise: FloatArray
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    # Kalman's recursions. Returns minus the log likelihood, the prediction of each reading (mean and variance of the level),
+    # and the state after the last reading with its covariance
+    first = np.flatnonzero(valid)[0]
     level, drift = readings[first], 0.0
-    p_level, p_both, p_drift = noise[first] ** 2, 0.0, drift_sd**2
-    surprise = 0.0
+    p_level, p_both, p_drift = noise[first] ** 2, 0.0, PRIOR_DRIFT_SD_SHARE**2
+    surprise, expected = 0.0, np.full((len(readings), 2), np.nan)
     for n in range(first + 1, len(readings)):
         level += steps[n] * drift
         p_level += 2.0 * steps[n] * p_both + steps[n] ** 2 * p_drift + steps[n] * step**2
@@ -459,6 +438,4 @@ def _filtered(
             p_drift -= gain_drift * p_both
             p_both -= gain_level * p_both
             p_level -= gain_level * p_level
-    state[0], state[1] = level, drift
-    covariance[0, 0], covariance[0, 1], covariance[1, 0], covariance[1, 1] = p_level, p_both, p_both, p_drift
-    return surprise
+    return surprise, expected, np.array([level, drift]), np.array([[p_level, p_both], [p_both, p_drift]])

@@ -46,10 +46,7 @@ def free_port(first: int, host: str) -> int:
 
 
 def serve(page: Path, first_port: int) -> None:
-    """
-    Serve a page, and open it in the browser, until the process is asked to end. Its address has a token, without which there
-    is nothing: no page, no connection, no upload.
-    """
+    """Serve a page at an address with a token, without which there is nothing, until the process is asked to end."""
     from streamlit.web import cli  # slow to import
 
     host, token = "127.0.0.1", secrets.token_hex(16)

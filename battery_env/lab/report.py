@@ -21,9 +21,7 @@ _COLUMN_OF = {"q_mobile": "q_mobile_C", "resistance_10s": "resistance_10s_ohm", 
 
 
 def quantity(text: str = "", unit: str = "", digits: int = 0, scale: float = 1.0) -> Any:
-    """
-    A column: its name for readers (a line has the last word of it), its unit, its digits, and the scale to that unit.
-    """
+    """A column: its name for readers (a line has the last word of it), its unit, its digits, and the scale to the unit."""
     return field(metadata={"text": text, "unit": unit, "digits": digits, "scale": scale})
 
 

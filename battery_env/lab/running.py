@@ -194,11 +194,7 @@ def figure_of(argument: str, folder: Path) -> Path:
 
 
 def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat) -> list[Discharge]:
-    """
-    Read the discharges of a cell before the one in progress: by their dates if all have dates, otherwise by their names. If
-    the arguments include the discharge in progress, only the discharges before it count. All records are taken for one
-    cell's, with a warning if they are in several folders. An unreadable record is left out with a warning.
-    """
+    """Read the discharges of a cell before the one in progress: by their dates if all have dates, otherwise by their names."""
     before: list[Discharge] = []
     after: list[Discharge] = []
     group, running_start = before, ""
@@ -238,10 +234,7 @@ def read_life(arguments: Sequence[str], running: Source, file_format: FileFormat
 def end_of_record(
     argument: str, settings: Settings, file_format: FileFormat, life: Sequence[str] = (), load: Path | None = None
 ) -> End:
-    """
-    Forecast the end of a discharge in a file, by the arguments of the command line: the file (of several discharges the last
-    one), the earlier discharges (none: the life is unknown) and the file of the load to come (``None``: as so far).
-    """
+    """Forecast the end of the last discharge in a file, by the arguments of the command line."""
     future_load = None if load is None else read_load(load)
     sources = find_sources([argument])
     if len(sources) > 1:

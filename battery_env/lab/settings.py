@@ -140,10 +140,6 @@ class Settings:
         stated = {name: value for name in resolved._fields if (value := getattr(self, name)) is not None}
         return resolved._replace(**stated)
 
-    def but(self, **changes: Any) -> Settings:
-        """Return settings with some changes; options that nobody stated follow a changed cell."""
-        return replace(self, **changes)
-
     def expecting(self, current_A: FloatArray) -> Settings:
         """
         Return settings with the expected model error at the age of the prior, if no error is stated and the constants were
@@ -263,28 +259,26 @@ class Settings:
         """
         if self.method == "policy":
             return PolicyEstimator.pretrained(recorded=True)
-        resolved = self.resolved
+        resolved, rates_sd = self.resolved, self._rates_sd()
         initial_soc: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
-        common: dict[str, Any] = {
-            "cell": cell or self.constants,
-            "thermal": resolved.thermal,
-            "prior_q_mobile_C": self.prior_q_mobile_C,
-            "current_gain_sd": self.current_gain_sd,
-            "initial_soc": initial_soc if start is None else (start.soc, start.sd_soc),
-            "q_mobile_bounds_C": self.q_mobile_bounds_C,
-            "usual_start": resolved.usual_start,
-        }
-        rates_sd = self._rates_sd()
         # free constants of any kind of cell explain as much of the model error as q_mobile and r_o absorb
-        is_explained = rates_sd is RATE_PRIOR_SD
-        mismatch_V = resolved.mismatch_V / UNFITTED_ERROR_RATIO if is_explained else resolved.mismatch_V
-        return LeastSquares(mismatch_V=mismatch_V, nuisance=rates_sd, path=self.path, size=size, **common)
+        explained_ratio = UNFITTED_ERROR_RATIO if rates_sd is RATE_PRIOR_SD else 1.0
+        return LeastSquares(
+            cell=cell or self.constants,
+            thermal=resolved.thermal,
+            mismatch_V=resolved.mismatch_V / explained_ratio,
+            prior_q_mobile_C=self.prior_q_mobile_C,
+            current_gain_sd=self.current_gain_sd,
+            initial_soc=initial_soc if start is None else (start.soc, start.sd_soc),
+            q_mobile_bounds_C=self.q_mobile_bounds_C,
+            usual_start=resolved.usual_start,
+            nuisance=rates_sd,
+            path=self.path,
+            size=size,
+        )
 
     def _rates_sd(self) -> Mapping[str, float]:
-        """
-        Uncertainty of the rate constants that least squares estimate with both parameters: of all constants that no setting
-        determines. A path determines them.
-        """
+        """Uncertainty of the rate constants that least squares estimate: of all that no setting, nor a path, determines."""
         if self.path is not None:
             return {}
         if self.cell_rates_sd is not None:

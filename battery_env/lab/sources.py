@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from battery_env.lab.readers.columns import FileFormat
+from battery_env.lab.readers.columns import FileFormat, few_of
 from battery_env.lab.readers.discharges import read_recordings
 from battery_env.lab.readers.tables import BINARY_SUFFIXES, NUMBERED_SUFFIXES, PACKED_SUFFIXES, TEXT_SUFFIXES, is_readable
 from battery_env.records.discharge import BUNDLED_CELLS, load_nasa_discharges
@@ -23,8 +23,6 @@ _RESULT_HEADS = (b"record,source,cell,cycle,", b"time_s,voltage_V,current_A,mode
 _NASA_SUFFIX = ".mat"
 # The table of tests of NASA's discharges, in the layout of the bundled ones, is no record.
 _NO_RECORDS = ("cycles.csv",)
-# Messages name at most so many files.
-_MOST_NAMED = 10
 # First characters of a formula in workbooks.
 _FORMULA_HEADS = ("=", "+", "-", "@")
 
@@ -82,10 +80,7 @@ def find_sources(arguments: Iterable[str]) -> list[Source]:
 
 
 def _records(folder: Path) -> list[Path]:
-    """
-    The files in a folder, and in those in it, that may be records, and folders that cannot be looked into; their numbers
-    count, so that 2 comes before 10. What is neither a record nor a result is named.
-    """
+    """Return the possible records in a folder, by their numbers, and unreadable folders; warn of all else but results."""
     records, ignored = [], []
 
     def unread(error: OSError) -> None:
@@ -105,11 +100,6 @@ def _records(folder: Path) -> list[Path]:
     if records and left_out:
         warnings.warn(f"{folder}: {few_of(left_out)} left out, by their names no records", stacklevel=3)
     return sorted(records, key=_by_number)
-
-
-def few_of(names: Sequence[str]) -> str:
-    """Return the first of many names as text."""
-    return ", ".join(names[:_MOST_NAMED]) + (f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else "")
 
 
 def _by_number(path: Path) -> tuple[list[list[str | int]], Path]:

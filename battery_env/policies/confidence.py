@@ -36,33 +36,25 @@ _LINEAR_STEP_V = 2e-3
 
 
 class Confidence:
-    """
-    Standard deviations and verdicts for the estimates of a policy.
+    """Standard deviations and verdicts for the estimates of a policy, whose task has a fit in its observation."""
 
-    :param task: task of the policy, with a fit in its observation
-    :param cell: constants of the model
-    :param dt_s: time step of the model, s
-    """
-
-    def __init__(self, task: VoltageTask, cell: CellParameters, dt_s: float) -> None:
+    def __init__(self, task: VoltageTask, cell: CellParameters) -> None:
         self._offset_V = task.sensors.offset_V
         self._path: AgingPath | None = task.path
         self._sd_ratio = 1.0 if task.path is None else task.path.sd_ratio
-        self._cell, self._dt_s = cell, dt_s
+        self._cell = cell
 
     def _model_V(self, fit: FitResult, n: int, record: Samples) -> FloatArray:
         """Return the voltage of the fitted model at the samples of a record."""
         cell = cell_with(self._cell, _by_name(fit, n))
         # a linear step may leave the ranges
         q_mobile, r_o = np.clip(fit.estimate[n], *np.array([ESTIMATE_RANGES[name] for name in PARAMETER_NAMES]).T).tolist()
-        return RecordModel(cell, dt_s=self._dt_s).voltage(record, Estimate(q_mobile, r_o)) + fit.offset_V[n]
+        return RecordModel(cell).voltage(record, Estimate(q_mobile, r_o)) + fit.offset_V[n]
 
     def estimate(self, fit: FitResult, n: int, estimate: FloatArray, record: Samples, history: ChargeHistory) -> Estimate:
-        """
-        Return the estimate with its standard deviations and its verdict, and along a path with the constants of the fit. A
-        standard deviation combines the fit's, the distance of the estimate from the fit, and the uncertainty of the charge.
-        The verdict uses the fit's standard deviations under a flat prior of the parameters.
-        """
+        """Return the estimate with standard deviations and verdict, and along a path with the constants of the fit."""
+        # a standard deviation combines the fit's, the distance of the estimate from the fit, and that of the charge;
+        # the verdict uses the fit's under a flat prior of the parameters
         cell, (q_mobile, r_o), path = self._cell, estimate.tolist(), self._path
         model_V = self._model_V(fit, n, record)
         evidence = evidence_of(record, cell, 1.0, (q_mobile, r_o), history, model_V)

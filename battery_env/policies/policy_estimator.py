@@ -37,9 +37,6 @@ from battery_env.tasks.env import CalibrationEnv, task_class
 from battery_env.tasks.voltage.fit import FitResult
 from battery_env.tasks.voltage.voltage_task import VoltageTask
 
-# Time step of the model of a stream, s
-_STEP_S = 1.0
-
 
 def _estimate_without_sd(values: FloatArray) -> Estimate:
     """Return an estimate without standard deviations or verdict."""
@@ -104,6 +101,8 @@ class PolicyEstimator(OnlineEstimator):
     :raises ValueError: if the id is not a calibration environment
     """
 
+    dt_s = 1.0  # time step of the model of a stream
+
     def __init__(self, policy: Predictor, env_id: str, decision_s: float = 60.0, **options: Any) -> None:
         self.policy = policy
         self.env_id = env_id
@@ -115,10 +114,9 @@ class PolicyEstimator(OnlineEstimator):
         check_positive("decision_s", decision_s)
         self.decision_s = decision_s
         self._no_constants = task.constants[0] if isinstance(task, VoltageTask) else np.zeros(0)
-        self.dt_s = _STEP_S
         self._confidence: Confidence | None = None
         if isinstance(task, VoltageTask) and task.fit() is not None:
-            self._confidence = Confidence(task, self.cell, self.dt_s)
+            self._confidence = Confidence(task, self.cell)
         self.reset()
 
     @classmethod

@@ -50,11 +50,7 @@ def pretrained_policy(env_id: str, recorded: bool = False) -> tuple[OnnxPolicy, 
 
 
 def policy_of_file(file: Path) -> tuple[OnnxPolicy, dict[str, Any]]:
-    """
-    Load a policy from a file, and the options of its task from its card.
-
-    :raises ValueError: if either is damaged, or they do not belong together
-    """
+    """Load a policy from a file, and the options of its task from its card."""
     policy, options = OnnxPolicy(file), dict(_read_card(file)["options"])
     if "path" in options:
         options["path"] = AgingPath.of_mapping(options["path"])

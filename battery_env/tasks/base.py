@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.checks import check_whole_number
-from battery_env.electrochemistry import FloatArray
-from battery_env.estimators.estimator import Record
-from battery_env.trajectories import IntArray
+from battery_env.arrays import FloatArray, IntArray
+from battery_env.records import Record
 
 if TYPE_CHECKING:
     from battery_env.tasks.voltage.fit import FitResult
@@ -23,23 +21,6 @@ Rows = NDArray[np.intp]
 Generators = Sequence[np.random.Generator]
 #: Limit of observations; the observations of a calibrated model are of order 1.
 OBSERVATION_LIMIT = 100.0
-
-
-def check_counts(**values: int) -> None:
-    """Refuse numbers below 1."""
-    for name, value in values.items():
-        if check_whole_number(name, value) < 1:
-            raise ValueError(f"{name} must be at least 1, got {value!r}")
-
-
-def checked_action(action: NDArray[np.floating], shape: tuple[int, ...]) -> FloatArray:
-    """Refuse an invalid action: compiled code would read beyond a short array, and NaN would spread through the episode."""
-    array = np.asarray(action)
-    if array.dtype.kind not in "fiu" or array.shape != shape:
-        raise ValueError(f"action must hold numbers, shape {shape}, got {array.dtype} values of shape {array.shape}")
-    if np.isnan(array).any():
-        raise ValueError(f"action must hold numbers in [-1, 1], got NaN: {array}")
-    return np.asarray(array, dtype=np.float64, order="C")
 
 
 class CalibrationTask(ABC):
@@ -115,6 +96,15 @@ class CalibrationTask(ABC):
         :return: cost, shape (cells,), at least 0
         :raises ValueError: for another shape, NaN, or a value that is no number
         """
+
+    def _checked_action(self, action: NDArray[np.floating]) -> FloatArray:
+        """Refuse an invalid action: compiled code would read beyond a short array, and NaN would spread."""
+        array, shape = np.asarray(action), (self.cells, len(self.parameters))
+        if array.dtype.kind not in "fiu" or array.shape != shape:
+            raise ValueError(f"action must hold numbers, shape {shape}, got {array.dtype} values of shape {array.shape}")
+        if np.isnan(array).any():
+            raise ValueError(f"action must hold numbers in [-1, 1], got NaN: {array}")
+        return np.asarray(array, dtype=np.float64, order="C")
 
     @abstractmethod
     def truncated(self) -> NDArray[np.bool_]:

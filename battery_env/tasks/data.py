@@ -23,7 +23,6 @@ Split = Literal["train", "test", "all"]
 DISCHARGES = 1000
 #: Seed of ages, loads and of the division into train and test: all data sets of a parameter hold the same cells.
 SEED = 0
-TEST_SHARE = 0.3
 
 #: Ages of the cells that discharge under other loads than the paper's, C and ohm.
 Q_MOBILE_RANGE_C = (4000.0, 7600.0)
@@ -95,7 +94,7 @@ def _splits(
         q_C, r_ohm, loads = ranges["q_mobile"], ranges["r_o"], _loads(load)
         cells = TrajectoryDataset.generate(parameters, DISCHARGES, loads, SEED, q_C, r_ohm, dt_s, cell=cell, mismatch=mismatch)
         cells = cells.trimmed(*PAPER_TRIM) if load == "paper" else cells
-    train, test = cells.split(test=TEST_SHARE, seed=SEED)
+    train, test = cells.split(seed=SEED)
     return {"train": train, "test": test, "all": cells}
 
 

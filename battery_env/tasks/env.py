@@ -11,12 +11,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.estimators.estimator import Record
+from battery_env.records import Record
 from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask
 
 _ROW = np.zeros(1, dtype=np.intp)
 FloatSpace = gym.Space[NDArray[np.float32]]
-_RENDER_MODES = ["rgb_array"]
 
 
 def task_class(task: str | type[CalibrationTask]) -> type[CalibrationTask]:
@@ -43,9 +42,8 @@ def new_task(task: str | type[CalibrationTask], cells: int, options: Mapping[str
 
 def spaces_of(task: CalibrationTask) -> tuple[FloatSpace, FloatSpace]:
     """Return the observation space and the action space of one cell."""
-    limit = OBSERVATION_LIMIT
     return (
-        gym.spaces.Box(-limit, limit, shape=(task.observation_size,), dtype=np.float32),
+        gym.spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT, shape=(task.observation_size,), dtype=np.float32),
         gym.spaces.Box(-1.0, 1.0, shape=(len(task.parameters),), dtype=np.float32),
     )
 
@@ -66,14 +64,14 @@ class CalibrationEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (as in gym.Env)
-        "render_modes": _RENDER_MODES,
+        "render_modes": ["rgb_array"],
         "render_fps": 10,
         "discount": 0.8,
     }
 
     def __init__(self, task: str | type[CalibrationTask], render_mode: str | None = None, **options: Any) -> None:
-        if render_mode not in (None, *_RENDER_MODES):
-            raise ValueError(f"render_mode must be None or one of {_RENDER_MODES}, got {render_mode!r}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
         self.render_mode = render_mode
         self.task = new_task(task, 1, options)
         self.observation_space, self.action_space = spaces_of(self.task)

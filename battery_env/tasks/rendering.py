@@ -10,9 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from battery_env.parameters import PARAMETERS
 from battery_env.tasks.base import CalibrationTask
-
-_LABELS = {"voltage": "voltage (V)", "q_mobile": "$q_{max}$ (C)", "r_o": "$R_o$ (ohm)"}
 
 
 def draw_frame(history: Sequence[dict[str, Any]], task: CalibrationTask) -> NDArray[np.uint8]:
@@ -20,11 +19,11 @@ def draw_frame(history: Sequence[dict[str, Any]], task: CalibrationTask) -> NDAr
     figure = Figure(figsize=(6, 4), dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     time = task.decision_s * np.arange(1, len(history) + 1)
-    names = ("voltage", *task.parameters)
-    for axes, name in zip(figure.subplots(len(names), 1, sharex=True), names, strict=True):
+    labels = {"voltage": "voltage (V)"} | {name: PARAMETERS[name].label for name in task.parameters}
+    for axes, (name, label) in zip(figure.subplots(len(labels), 1, sharex=True), labels.items(), strict=True):
         axes.plot(time, [info[name] for info in history], color="0.2", lw=2.5, label="cell")
         axes.plot(time, [info[f"{name}_hat"] for info in history], color="#d55e00", lw=1.2, label="model")
-        axes.set(ylabel=_LABELS[name], xlim=(0.0, task.episode_steps * task.decision_s))
+        axes.set(ylabel=label, xlim=(0.0, task.episode_steps * task.decision_s))
         axes.ticklabel_format(useOffset=False)
     axes.set_xlabel("time in the episode (s)")
     axes.legend(loc="best", fontsize="small", frameon=False)

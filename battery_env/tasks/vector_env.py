@@ -12,11 +12,10 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from battery_env.electrochemistry import FloatArray
+from battery_env.arrays import BoolArray, FloatArray
+from battery_env.checks import check_whole_number
 from battery_env.tasks.base import CalibrationTask
 from battery_env.tasks.env import CalibrationEnv, new_task, spaces_of
-
-Mask = NDArray[np.bool_]
 
 
 class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
@@ -45,9 +44,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs!r}")
-        self.num_envs = num_envs
+        self.num_envs = check_whole_number("num_envs", num_envs, 1)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.DISABLED:
             raise ValueError("autoreset_mode must be 'NextStep' or 'SameStep', got 'Disabled'")
@@ -57,7 +54,7 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators: list[np.random.Generator] = []
-        self._needs_reset: Mask = np.zeros(num_envs, dtype=np.bool_)
+        self._needs_reset: BoolArray = np.zeros(num_envs, dtype=np.bool_)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -85,7 +82,9 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         self._start(~self._needs_reset, options)
         return self.task.observation(), self._info(np.zeros(self.num_envs))
 
-    def step(self, actions: NDArray[np.float32]) -> tuple[NDArray[np.float32], FloatArray, Mask, Mask, dict[str, Any]]:
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """
         Take one decision in every cell.
 
@@ -113,17 +112,17 @@ class CalibrationVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.
         info = {**final, **self._info(cost)}
         return self.task.observation(), reward, np.zeros(self.num_envs, dtype=np.bool_), truncated, info
 
-    def _start(self, mask: Mask, options: Mapping[str, Any] | None = None) -> None:
+    def _start(self, mask: BoolArray, options: Mapping[str, Any] | None = None) -> None:
         rows = np.flatnonzero(mask)
         self.task.start(rows, [self._generators[n] for n in rows.tolist()], options)
 
-    def _info(self, cost: FloatArray, mask: Mask | None = None) -> dict[str, Any]:
+    def _info(self, cost: FloatArray, mask: BoolArray | None = None) -> dict[str, Any]:
         info: dict[str, Any] = {"cost": cost, **self.task.report()}
         valid = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask
         info.update({f"_{name}": valid.copy() for name in tuple(info)})
         return info
 
-    def _final(self, mask: Mask, cost: FloatArray) -> dict[str, Any]:
+    def _final(self, mask: BoolArray, cost: FloatArray) -> dict[str, Any]:
         observation, observations = self.task.observation(), np.full(self.num_envs, None, dtype=object)
         for n in np.flatnonzero(mask).tolist():
             observations[n] = observation[n]

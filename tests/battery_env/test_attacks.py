@@ -451,7 +451,7 @@ def test_nor_is_one_with_constants_that_were_fitted_to_the_wrong_discharges(fitt
         for share in (0.25, 0.5, 0.75, 1.0):
             record = begun(discharge, share, cut_off_V) if share < 1.0 else discharge
             try:
-                found = calibrated(record, Settings(cell=fit), samples=100)
+                found = calibrated(record, Settings(cell=fit))
             except ValueError as error:  # takes more charge than a cell that was fitted when old ever holds
                 assert fitted == "old" and "beyond the upper bound" in str(error)
                 continue

@@ -14,6 +14,8 @@ from battery_env.checks import ZERO_CELSIUS_K
 from battery_env.lab.readers.testers import LONGEST, QUANTITIES, REQUIRED, SUBSTITUTES, TESTERS, Tester, merge, words_of
 from battery_env.records.refusals import Advice, RecordError
 
+# Messages name at most so many columns, rows or files.
+_MOST_NAMED = 10
 # Quantities whose names need a unit: p and q may mean anything.
 _WITH_UNIT = ("counter", "power", "charge_step", "capacity")
 
@@ -134,11 +136,7 @@ class TableHeader(NamedTuple):
 
 
 def recognise(names: Sequence[str], file_format: FileFormat, rows: Sequence[Sequence[str]]) -> TableHeader:
-    """
-    Recognise the tester of a table, the first with a mark in the header, and its columns. A name, as in ``Current(mA)``,
-    ``Voltage / V``, ``mAmps`` or ``test_time_second``, or the line below it, gives the unit. A column with a unit of another
-    quantity is excluded.
-    """
+    """Recognise the tester of a table, the first with a mark in the header, and its columns with their units."""
     names = [str(name).strip() for name in names]
     labels = _labels(names, rows, {name.strip() for name in file_format.ignore})
     keys = {key for label in labels for key, _ in _name_candidates(label)}
@@ -255,6 +253,11 @@ def direction(state: object) -> int:
     """Return 1 for a tester's word for discharge, -1 for a word for charge, else 0."""
     words = " ".join(words_of(str(state)))
     return 1 if _DISCHARGE.search(words) else -1 if _CHARGE.search(words) else 0
+
+
+def few_of(names: Sequence[str]) -> str:
+    """Return the first of many names as text."""
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else "")
 
 
 def notify(text: str) -> None:

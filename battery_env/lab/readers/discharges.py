@@ -16,7 +16,7 @@ import pandas as pd
 
 from battery_env.arrays import FloatArray
 from battery_env.checks import LOAD_LIMITS
-from battery_env.lab.readers.columns import FileFormat, notify, recognise
+from battery_env.lab.readers.columns import FileFormat, few_of, notify, recognise
 from battery_env.lab.readers.nasa import read_nasa_mat
 from battery_env.lab.readers.rows import FEW_SHARE, NOTHING_SHARE, changes, refuse_other_unit, rows_of
 from battery_env.lab.readers.signs import LARGE_SHARE, with_signed_current
@@ -187,8 +187,7 @@ def _split(rows: pd.DataFrame, origin: Origin) -> list[Recording]:
         if NOTHING_SHARE**2 * largest_C < drawn_C < LOAD_SHARE * largest_C  # less is noise of a sensor
     ]
     if dropped:
-        first = "; ".join(dropped[:3]) + (" and others" if len(dropped) > 3 else "")
-        notify(f"left aside, as they draw less than {LOAD_SHARE:.0%} of the largest: {len(dropped)} ({first})")
+        notify(f"left aside, as they draw less than {LOAD_SHARE:.0%} of the largest: {len(dropped)} ({few_of(dropped)})")
     candidates = [candidate for candidate in candidates if candidate.drawn_C >= LOAD_SHARE * largest_C]
     histories = [ChargeHistory(charge=_charge_before(rows, candidate.charge)) for candidate in candidates]
     meta: dict[str, Any] = {"source": origin.source}
@@ -209,10 +208,8 @@ def _no_discharge(rows: pd.DataFrame) -> RecordError:
 
 
 def _bounds(rows: pd.DataFrame) -> list[int]:
-    """
-    Return the bounds of tests: where the number of the cycle changes, and the clock restarts, a current of no cell begins or
-    ends, or, without logged charges, the voltage returns after its fall. Counters may count loops otherwise.
-    """
+    """Return the bounds of tests: where the number of the cycle, which may count loops, and something else change."""
+    # the clock restarts, a current of no cell begins or ends, or, without logged charges, the voltage returns after its fall
     time_s, voltage_V, current_A = (rows[name].to_numpy() for name in ("time", "voltage", "current"))
     are_charges_logged = any(charge.is_end for charge in _charges(rows, _net_charge_C(time_s, current_A)))
     bounds, numbers = [0], [0, *np.flatnonzero(changes(rows, "cycle")), len(rows)]

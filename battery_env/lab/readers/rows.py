@@ -14,38 +14,32 @@ import pandas as pd
 
 from battery_env.arrays import BoolArray, FloatArray
 from battery_env.checks import check_real
-from battery_env.lab.readers.columns import Column, FileFormat, TableHeader, direction, notify
+from battery_env.lab.readers.columns import Column, FileFormat, TableHeader, direction, few_of, notify
 from battery_env.lab.readers.testers import REQUIRED
 from battery_env.records import REST_CURRENT_A, SWITCH_SHARE, switches
 from battery_env.records.discharge import CLOCKS, LEAST_SAMPLES
 from battery_env.records.refusals import Advice, RecordError
-from battery_env.records.samples import PLAUSIBLE
+from battery_env.records.samples import PLAUSIBLE, SAMPLE_INTERVAL_LIMITS_S
 
 #: A smaller share of the charge is negligible.
 NOTHING_SHARE = 1e-3
 #: Share of rows, or of the charge, that a record may lack; tolerance of two clocks, or of a clock and a counter.
 FEW_SHARE = 0.01
-# Two rows of different steps may have the same time; the second row counts as later by this, s.
-_STEP_S = 1e-3
 _DATES: tuple[dict[str, Any], ...] = ({"format": "ISO8601"}, {}, {"dayfirst": True})
 
 
 def rows_of(table: pd.DataFrame, header: TableHeader, file_format: FileFormat) -> pd.DataFrame:
-    """
-    Return the rows of a table in SI units and in order, with the file's sign of the current. The columns of the table are by
-    quantity; its index counts the rows below the header.
-    """
+    """Return the rows of a table with columns by quantity in SI units and in order, with the file's sign of the current."""
     rows = with_current(with_clock(in_si_units(table, header), header.columns), header.columns, file_format)
     return in_order(without_incomplete(rows, header.open_questions))
 
 
-def place_of(rows: pd.DataFrame, selection: BoolArray | pd.Series[bool], max_runs: int = 10) -> str:
-    """Return rows as text, in the file's count: at most ``max_runs`` runs, and the number of rows."""
+def place_of(rows: pd.DataFrame, selection: BoolArray | pd.Series[bool]) -> str:
+    """Return rows as text, in the file's count: the first runs, and the number of rows."""
     row_numbers = rows.index[selection].to_numpy() + 1
     runs = np.split(row_numbers, np.flatnonzero(np.diff(row_numbers) > 1) + 1)
-    text = ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs[:max_runs])
-    suffix = " and others" if len(runs) > max_runs else ""
-    return f"{text}{suffix} ({len(row_numbers)} rows)" if len(row_numbers) > 1 else text
+    text = few_of([f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs])
+    return f"{text} ({len(row_numbers)} rows)" if len(row_numbers) > 1 else text
 
 
 def in_si_units(table: pd.DataFrame, header: TableHeader) -> pd.DataFrame:
@@ -242,10 +236,7 @@ def with_current(rows: pd.DataFrame, columns: Mapping[str, Column], file_format:
 
 
 def without_incomplete(rows: pd.DataFrame, open_questions: Collection[str]) -> pd.DataFrame:
-    """
-    Drop rows without a measurement, such as blanks, titles, repeated headers, and rows at the ends without a cell; and drop a
-    few rows whose time, voltage or current is missing or implausible.
-    """
+    """Drop rows without a measurement, or at the ends without a cell, and a few with a missing or implausible value."""
     has_value = np.isfinite(rows[list(REQUIRED)])
     rest_A = min(REST_CURRENT_A, NOTHING_SHARE * rows["current"].abs().max())  # a small cell may draw less than REST_CURRENT_A
     is_no_cell = (rows["voltage"] < 0.1 * rows["voltage"].median()) & (rows["current"].abs() <= rest_A)
@@ -278,10 +269,7 @@ def changes(rows: pd.DataFrame, name: str) -> BoolArray:
 
 
 def in_order(rows: pd.DataFrame) -> pd.DataFrame:
-    """
-    Order rows at one time: the second row is later if the step changes or the load is switched; otherwise drop it, if few are.
-    Refuse a clock that goes back, except where the number of the cycle changes.
-    """
+    """Order rows at one time, or drop a few of them; refuse a clock that goes back, except where the cycle changes."""
     time_s = rows["time"].to_numpy()
     step_s = np.diff(time_s, prepend=np.nan)
     goes_back = (step_s < 0.0) & ~changes(rows, "cycle")
@@ -300,4 +288,5 @@ def in_order(rows: pd.DataFrame) -> pd.DataFrame:
     if (is_odd := is_same_time & ~changes(rows, "step")).any():
         notify(f"row {place_of(rows, is_odd)} has the time of the row before: later where the load is switched, else left out")
     n = np.arange(len(rows))
-    return rows.assign(time=time_s + _STEP_S * (n - np.maximum.accumulate(np.where(is_later, 0, n))))[~is_repeated]
+    later_s = SAMPLE_INTERVAL_LIMITS_S[0] * (n - np.maximum.accumulate(np.where(is_later, 0, n)))
+    return rows.assign(time=time_s + later_s)[~is_repeated]

@@ -230,11 +230,9 @@ def _read_text(content: bytes, options: dict[str, Any], header: TableHeader) -> 
 
 
 def _find_header(tables: Mapping[Key, Sequence[Sequence[str]]], file_format: FileFormat) -> tuple[Key, int, list[str]]:
-    """
-    Find the names of the columns: return their table, by delimiter or by sheet, their row, and the names. The header is above
-    rows of numbers in equally many fields, or, if it names a whole record, in fewer fields, and names most quantities. Without
-    a header the row is the one above the numbers, and the names are numbers of columns.
-    """
+    """Return the table with the header, by delimiter or by sheet, the row of the header, and the names in it."""
+    # the header is above rows of numbers in equally many fields, or, if it names a whole record, in fewer fields, and names
+    # most quantities; without a header the names are numbers of columns
     candidates: dict[tuple[str, ...], tuple[bool, int, int, int, Key]] = {}  # by names, which may repeat
     largest_count, first, number_table = 0, 0, next(iter(tables))
     for key, rows in tables.items():

@@ -34,29 +34,19 @@ SUBSTITUTES = {"time": ("date",), "current": ("power", "charge_step")}
 
 @dataclass(frozen=True)
 class Tester:
-    """
-    The layout of a tester's tables.
-
-    :param name: name of the tester
-    :param columns: names of columns without units, by quantity; the first name in a table counts. Capitals, blanks and signs
-        do not count. ``time`` runs through the test; ``counter`` is the counter electrode of the voltage, ``charge_step`` the
-        charge since the previous row, and ``capacity`` the tester's count of the charge drawn
-    :param marks: names that identify a table of this tester
-    :param units: units of names without a unit, by quantity; else s, V, A, degC and Ah
-    :param discharge_is_negative: whether the current of a discharge is negative, if voltage and words do not decide
-    :param encoding: of its text, if not UTF-8
-    :param missing: text for a missing value, besides nothing and NaN
-    :param argument: the file of this row
-    """
+    """The layout of a tester's tables."""
 
     name: str
+    # names without units, by quantity; the first in a table counts, and capitals, blanks and signs do not. time runs through
+    # the test; counter is the counter electrode of the voltage, charge_step the charge since the previous row, and capacity
+    # the tester's count of the charge drawn
     columns: Mapping[str, Sequence[str]]
-    marks: Sequence[str] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
-    discharge_is_negative: bool | None = None
-    encoding: str = ""
-    missing: Sequence[str] = ()
-    argument: str = ""
+    marks: Sequence[str] = ()  # names that identify a table of this tester
+    units: Mapping[str, str] = field(default_factory=dict)  # of names without a unit; else s, V, A, degC and Ah
+    discharge_is_negative: bool | None = None  # if voltage and words do not decide
+    encoding: str = ""  # of its text, if not UTF-8
+    missing: Sequence[str] = ()  # text for a missing value, besides nothing and NaN
+    argument: str = ""  # the file of this row
 
     def __str__(self) -> str:
         return self.argument or self.name

@@ -1,6 +1,4 @@
-"""
-Calibration from the full state of a cell as a Markov decision process (Unagar et al. 2020), for a batch of cells at once.
-"""
+"""Calibration from the full state of a cell as a Markov decision process (Unagar et al. 2020), for a batch of cells."""
 
 from __future__ import annotations
 
@@ -11,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.arrays import IntArray
-from battery_env.checks import check_not_negative
-from battery_env.electrochemistry import NEW_CELL, FloatArray, Trajectory
+from battery_env.arrays import FloatArray, IntArray
+from battery_env.checks import check_not_negative, check_whole_number
+from battery_env.electrochemistry import NEW_CELL, Trajectory
 from battery_env.electrochemistry.kernels import voltage_batch
 from battery_env.parameters import PARAMETER_NAMES
-from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
+from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows
 from battery_env.tasks.data import Split, open_dataset, standard_dataset
 from battery_env.tasks.full_state.decisions import decide, look_ahead, observe
 from battery_env.tasks.full_state.layout import (
@@ -81,8 +79,8 @@ class FullStateTask(CalibrationTask):
         if first_sample_probability > 1.0:
             raise ValueError(f"first_sample_probability must be at most 1, got {first_sample_probability!r}")
         self.cells = cells
-        self.episode_steps = self.episode_steps if episode_steps is None else episode_steps
-        check_counts(episode_steps=self.episode_steps)
+        if episode_steps is not None:
+            self.episode_steps = check_whole_number("episode_steps", episode_steps, 1)
         if dataset is None:
             self.dataset = standard_dataset(self.parameters, "paper", split)
         else:
@@ -184,7 +182,7 @@ class FullStateTask(CalibrationTask):
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """Take the actions, step the model, and move on to the next sample."""
-        actions, cost = checked_action(action, (self.cells, len(self.parameters))), np.empty(self.cells)
+        actions, cost = self._checked_action(action), np.empty(self.cells)
         decide(actions, self._settings, self.cell_records, cost)
         self._look_ahead(self.cell_records)
         return cost

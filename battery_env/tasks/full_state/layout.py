@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from battery_env.electrochemistry import STATE_SIZE, VO, VSP, FloatArray
+from battery_env.arrays import FloatArray
+from battery_env.electrochemistry import STATE_SIZE, VO, VSP
 from battery_env.electrochemistry.cell import CONSTANTS_SIZE, POLYNOMIAL_SIZE
 
 Records = NDArray[np.void]

@@ -67,8 +67,8 @@ _FLAT_PRECISION = 1e-6
 #: Scales of an observation; the scale of a standard deviation is this share of the range of the estimate
 VOLTAGE_SCALE_V = 0.010
 _SD_SCALE = 0.01
-# Least standard deviation of the noise, V.
-_MIN_NOISE_V = 0.001
+#: Least standard deviation of the noise of a voltage sensor, V.
+LEAST_NOISE_V = 0.001
 # Iterations of the noise estimate from the residuals after the step
 _NOISE_ROUNDS = 3
 
@@ -103,10 +103,7 @@ class FitPrior:
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, tuple[float, float]], offset_V: float, nuisance: float) -> FitPrior:
-        """
-        Make a prior of independent unknowns: parameters have the mean and the standard deviation of their ranges, C and ohm,
-        and constants the relative standard deviation ``nuisance``.
-        """
+        """Make a prior of parameters with the moments of their ranges, C and ohm, and constants of this relative sd."""
         limits = np.array(list(ranges.values()))
         constants = np.full(len(UNCERTAIN_CONSTANTS), np.sqrt(np.log1p(nuisance**2)))
         uniform = np.append(np.ptp(limits, axis=1), 2.0 * offset_V) / np.sqrt(12.0)
@@ -162,7 +159,8 @@ class NuisanceFit:
         self._prior_rows = StepPrior(means, units, prior.precision, prior.flat_precision, mismatch_V, errors_per_C)
         self._first = np.zeros(unknowns - _KN) if prior.path is None else prior.mean[_KN:]
         self.constants = np.tile(self._first, (cells, 1))
-        self._solution = np.zeros((cells, solution_size(unknowns)))
+        # of each cell a step and an sd of each unknown, the noise, and two sds under a flat prior
+        self._solution = np.zeros((cells, 2 * unknowns + 3))
         self._equilibrium = _equilibrium_terms(cell, unknowns - _EQUILIBRIUM)
         self.observation_size = 2 * len(PARAMETER_NAMES) + 2 + unknowns - _KN
 
@@ -212,11 +210,6 @@ class NuisanceFit:
             np.arcsinh(self._solution[:, _OFFSET, None] / VOLTAGE_SCALE_V),
             (self.constants - self._first) / self.prior.observation_scale,
         ]
-
-
-def solution_size(unknowns: int) -> int:
-    """Return the length of a solution: a step and an sd of each unknown, the noise, and two sds under a flat prior."""
-    return 2 * unknowns + 3
 
 
 @lru_cache(maxsize=4)
@@ -507,12 +500,8 @@ def nuisance_step(
     prior: StepPrior,
     solution: FloatArray,
 ) -> None:
-    """
-    Take one Gauss-Newton step towards the best unknowns of each cell under their prior, into ``solution``, shape (n,
-    ``solution_size``); unchecked, all arrays contiguous. ``equilibrium_terms`` are those of the coefficients among the
-    constants, shape (coefficients, 1 + POLYNOMIAL_SIZE); other arguments as of
-    :func:`battery_env.tasks.voltage.readings.summarise_residuals`.
-    """
+    # Take one Gauss-Newton step towards the best unknowns of each cell under their prior, into solution; unchecked. Arguments
+    # as of summarise_residuals, and the equilibrium_terms of the coefficients among the constants
     unknowns = prior.mean.shape[1]
     sums, values = np.empty((unknowns + 1, unknowns + 1)), np.zeros(unknowns)
     for n in rows:
@@ -520,6 +509,6 @@ def nuisance_step(
         values[_Q], values[_R] = estimate[n, 0], estimate[n, 1]
         values[_KN:] = constants[n]
         errors = independent_errors(max(drawn_C, 0.0), prior.errors_per_C)
-        least_noise_V = np.sqrt(_MIN_NOISE_V**2 + prior.mismatch_V**2 * count[n] / errors)
+        least_noise_V = np.sqrt(LEAST_NOISE_V**2 + prior.mismatch_V**2 * count[n] / errors)
         mean, units, precision, flat_precision = prior.mean[n], prior.units[n], prior.precision, prior.flat_precision
         _solve_under_priors(sums, values, count[n], least_noise_V, mean, units, precision, flat_precision, solution[n])

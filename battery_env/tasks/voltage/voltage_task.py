@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from battery_env.arrays import FloatArray, IntArray
-from battery_env.checks import check_not_negative
+from battery_env.checks import check_not_negative, check_whole_number
 from battery_env.electrochemistry import CellParameters, check_cell
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import Record
 from battery_env.sensors import RandomSensorErrors
-from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows, check_counts, checked_action
+from battery_env.tasks.base import OBSERVATION_LIMIT, CalibrationTask, Generators, Rows
 from battery_env.tasks.data import LoadKind, Split, open_dataset, standard_dataset
-from battery_env.tasks.voltage.fit import VOLTAGE_SCALE_V, FitPrior, FitResult, NuisanceFit
+from battery_env.tasks.voltage.fit import LEAST_NOISE_V, VOLTAGE_SCALE_V, FitPrior, FitResult, NuisanceFit
 from battery_env.tasks.voltage.readings import CURRENT, MEASURED, OHMIC, SENSOR_ROWS, Readings, summarise_residuals
 from battery_env.trajectories import TrajectoryDataset
 
@@ -35,14 +35,13 @@ FURTHEST_SD = 2.0
 #: Number of equal stretches of the data so far; an observation has two means a stretch, of less and of more current.
 STRETCHES = 16
 #: Sensors of the discharges in episodes.
-SENSORS = RandomSensorErrors(noise_V=(0.001, 0.030), offset_V=0.010)
+SENSORS = RandomSensorErrors(noise_V=(LEAST_NOISE_V, 0.030), offset_V=0.010)
 
 #: The cost of a decision: the misfit of the estimate to the readings, or the error of the model's hidden state.
 Cost = Literal["misfit", "state"]
 _COST_SCALE_V = 0.002
 _STATE_COST_SCALE = 0.01
 # Scales of an observation
-_MISFIT_FLOOR_V = 0.001
 _SLOPE_SCALE_V_PER_C = 5e-5
 _CURRENT_SCALE_A = 3.0
 _TIME_SCALE_S = 3000.0
@@ -101,7 +100,6 @@ class VoltageTask(CalibrationTask):
         dataset: Sequence[Record] | str | os.PathLike[str] | None = None,
         **sensors: Any,
     ) -> None:
-        check_counts(episode_steps=episode_steps)
         check_not_negative(process_noise_V=process_noise_V, nuisance=nuisance)
         if not 0 <= new_readings[0] <= new_readings[1]:
             raise ValueError(f"new_readings must be (fewest, most) with 0 <= fewest <= most, got {new_readings!r}")
@@ -115,7 +113,8 @@ class VoltageTask(CalibrationTask):
                 raise ValueError("path says how far constants are off: leave nuisance and mismatch out")
         choices = {"load": load, "split": split, "dt_s": dt_s, "mismatch": mismatch}
         self._open(dataset, reading_s, cell, path, choices)
-        self.cells, self.new_readings, self.episode_steps = cells, new_readings, episode_steps
+        self.cells, self.new_readings = cells, new_readings
+        self.episode_steps = check_whole_number("episode_steps", episode_steps, 1)
         self.sensors = replace(SENSORS, **sensors)
         self.process_noise_V, self.first_estimate = process_noise_V, start
         self.decision_s = self.readings.interval_s * (sum(new_readings) / 2.0)
@@ -203,10 +202,7 @@ class VoltageTask(CalibrationTask):
 
     @classmethod
     def options(cls) -> dict[str, Any]:
-        """
-        Return the options of the task, which its page explains; those of the sensors are the fields of
-        :class:`~battery_env.sensors.RandomSensorErrors`.
-        """
+        """Return the options of the task, which its page explains, and of its sensors."""
         return {**super().options(), **asdict(SENSORS)}
 
     def start(self, rows: Rows, generators: Generators, options: Mapping[str, Any] | None = None) -> None:
@@ -357,10 +353,10 @@ class VoltageTask(CalibrationTask):
         residual_V, slope_V_per_C, ohmic_A = self._means
         unexplained_V = residual_V - self._offset_V[:, None, None]
         return [
-            (unexplained_V / (self._misfit_V + _MISFIT_FLOOR_V)[:, None, None]).reshape(self.cells, -1),
+            (unexplained_V / (self._misfit_V + LEAST_NOISE_V)[:, None, None]).reshape(self.cells, -1),
             np.arcsinh(slope_V_per_C / _SLOPE_SCALE_V_PER_C).reshape(self.cells, -1),
             (ohmic_A / _CURRENT_SCALE_A).reshape(self.cells, -1),
-            np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * _MISFIT_FLOOR_V) / VOLTAGE_SCALE_V),
+            np.log((np.stack([self._misfit_V, self._rms_V], axis=1) + 0.1 * LEAST_NOISE_V) / VOLTAGE_SCALE_V),
             np.arcsinh(residual_V.mean(axis=(1, 2)) / VOLTAGE_SCALE_V)[:, None],
             (self._time_s / _TIME_SCALE_S)[:, None],
             self._scaled(self._estimate),
@@ -372,7 +368,7 @@ class VoltageTask(CalibrationTask):
 
     def advance(self, action: NDArray[np.floating]) -> FloatArray:
         """Move the estimates, let new readings arrive, and compare all data so far with the model."""
-        step = np.clip(checked_action(action, (self.cells, len(self.parameters))), -1.0, 1.0)
+        step = np.clip(self._checked_action(action), -1.0, 1.0)
         if self._fit is not None and self.path is not None:
             estimate = self._fit.estimate_at(self._estimate, FURTHEST_SD * step)
         else:
@@ -400,7 +396,6 @@ class VoltageTask(CalibrationTask):
 
     def report(self) -> dict[str, FloatArray]:
         """Return the state of each cell; true parameters are NaN for recorded discharges, ``voltage`` is measured."""
-
         data, last = self.readings, self.count - 1
         true_q_C = data.q_mobile[self.discharge]
         return {
