@@ -41,7 +41,6 @@ from battery_env.arrays import FloatArray
 from battery_env.electrochemistry.aging_path import PATH_NAMES, cell_with
 from battery_env.electrochemistry.ends import BAND
 from battery_env.estimates import last_estimate
-from battery_env.files import replacing
 from battery_env.lab.life import Life, track_life
 from battery_env.lab.running import forecast_end
 from battery_env.lab.settings import Settings
@@ -345,8 +344,7 @@ def export(seeds: Sequence[int], folder: Path, command: str, scores: pd.DataFram
     runs = [run_of("lac", BUNDLED_CELLS, seed, folder) for seed in seeds]
     models = [train_or_load(run, folder / "models") for run in runs]
     file = folder / f"{file_stem(ENV_ID, recorded=True)}.onnx"
-    with replacing(file) as part_of_file:
-        export_onnx(models, part_of_file, ENV_ID)
+    export_onnx(models, file, ENV_ID)
     card = {
         "env_id": ENV_ID,
         "options": {**OPTIONS, "path": path.to_mapping()},

@@ -29,7 +29,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from battery_env.evaluation import over_seeds
 from battery_env.plotting import coloured
 from benchmarks import roots
-from benchmarks.control import DISTURBANCES, IMPULSE_INTERVAL, conditions, one_at_a_time, roll_out
+from benchmarks.control import DISTURBANCES, IMPULSE_INTERVAL, conditions, one_at_a_time, roll_out, while_training
 from benchmarks.runs import Run, make_rows, rows_command_line, setting_of_lac
 from benchmarks.study import Study, add_legend, digits, markdown, natural, new_panels, table_of, with_interval
 from sb3_lac.stability.plots import format_log_axis
@@ -50,8 +50,6 @@ ALGORITHMS = {**roots.ALGORITHMS, "tqc": ("TQC", "sb3_contrib:TQC", None)}
 #: Whom they are compared with.
 RIVALS = ("SAC", "TQC")
 EPISODES = 100
-# the episodes of learning curves have other starts
-_CURVE_EPISODES, _CURVE_SEED = 30, 40_000
 #: LAC is level with a rival that costs at least so much of what it costs.
 LEVEL = 0.98
 
@@ -82,8 +80,7 @@ def run_of(env_id: str, algorithm: str, seed: int, last_actions: int = 0, timest
 
 def cost_while_training(model: OffPolicyAlgorithm, run: Run) -> float:
     """A step of the plant that changes, as in the training."""
-    make = partial(gym.make, run.task, **run.environment)
-    return float(roll_out(model, make, _CURVE_EPISODES, _CURVE_SEED)["cost"].mean())
+    return float(while_training(model, run.task, run.environment)["cost"])
 
 
 def costs(model: OffPolicyAlgorithm, run: Run) -> dict[str, float]:

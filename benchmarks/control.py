@@ -48,8 +48,10 @@ LINEAR_FACTORS = {"reference": 1.0, "weak": 0.15, "hardly unstable": -0.14, "wro
 STATEMENTS = ("survives", "stays_within", "decreases")
 #: Environments of a certificate, which an equal number of episodes each start in.
 CERTIFICATE_ENVS = 25
+#: Episodes of a point of a learning curve.
+CURVE_EPISODES = 30
 # no training seed comes close; environments count up from each
-_FIT_SEED, _JUDGE_SEED, _CERTIFICATION_SEED = 10_000, 20_000, 30_000
+_FIT_SEED, _JUDGE_SEED, _CERTIFICATION_SEED, _CURVE_SEED = 10_000, 20_000, 30_000, 40_000
 
 
 def conditions(env_id: str) -> dict[str, dict[str, Any]]:
@@ -136,6 +138,12 @@ def tried_with(
     problem = gym.make(env_id).unwrapped
     assert isinstance(problem, CostEnv)
     return summary(roll_out(policy, partial(make, env_id, **arguments), episodes, seed), problem.error_tolerance)
+
+
+def while_training(policy: PolicyPredictor, env_id: str, arguments: Mapping[str, Any]) -> dict[str, float]:
+    """Judge a policy for its learning curve, in episodes with other starts than those of all other judgements."""
+    outcome = tried_with(policy, env_id, CURVE_EPISODES, arguments, seed=_CURVE_SEED)
+    return {name: outcome[name] for name in ("cost", "at_goal")}
 
 
 def tried(policy: PolicyPredictor, env_id: str, episodes: int) -> pd.DataFrame:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -106,7 +106,6 @@ def training_file(parameter: Parameter, out: Path) -> Path:
     """The discharges of the less aged cells, as a file."""
     file = out / "data" / f"{parameter}.npz"
     if not file.exists():
-        file.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileExistsError):  # of another part, which has made the same
             divided(parameter, "parameter")[0].save(file)
     return file
@@ -282,8 +281,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for seed in chosen.seeds
         for parameter in ENV_IDS
     ]
-    for parameter in () if study.redraws else get_args(Parameter):
-        training_file(parameter, study.out)  # here, as parts that make the same file meet
     tables_of_parts = [study.run(mapping_part, mappings), study.run(policy_part, policies, out=study.out)]
     tables_of_parts.append(study.run(exact_part, places))
     results_in_order = pd.concat([tables["direct_mapping"] for tables in tables_of_parts if tables], ignore_index=True)

@@ -4,7 +4,7 @@ as an ONNX file with a card that says what made it and what it is worth.
 
 .. code-block:: bash
 
-  python -m benchmarks.pretrained --envs BatteryVoltageJoint-v0 --updates 16000 --out results/pretrained_joint
+  python -m benchmarks.pretrained --updates 16000 --out results/pretrained_joint
 
 File and card are shipped from ``battery_env/policies/pretrained_policies``; :mod:`benchmarks.aging_paths` makes the policy for
 recorded cells. The settings are those of ``zoo_configs``, with the options of the task below. Scores are of held-out
@@ -22,7 +22,6 @@ from typing import Any
 import pandas as pd
 
 from battery_env.evaluation import evaluate
-from battery_env.files import replacing
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.policies.policy_estimator import PolicyEstimator
 from battery_env.policies.pretrained import file_stem, policy_of_file, write_card
@@ -45,7 +44,7 @@ from benchmarks.study import (
 from benchmarks.zoo_runs import zoo_run
 from sb3_lac.onnx import export_onnx
 
-ENV_IDS = ["BatteryVoltageJoint-v0"]
+ENV_ID = "BatteryVoltageJoint-v0"
 #: How far kn, tDiffusion, to and tsn of the cells are from the model's, in training and as the observation takes them to be.
 MISMATCH = 0.2
 #: Options of the task that a policy needs when it is used.
@@ -56,23 +55,25 @@ TRAINED_WITH: dict[str, Any] = {**OPTIONS, "new_readings": [0, 145], "mismatch":
 MISMATCHES = (0.0, 0.1, 0.2)
 
 
-def make(env_id: str, seed: int, updates: int, folder: Path) -> Run:
-    """Train a policy, unless that has been done, and write it as ONNX, with the options that it needs beside it."""
-    run = zoo_run("lac", env_id, seed, updates=updates, differing={"env_kwargs": TRAINED_WITH})
-    model = train_or_load(run, folder / "models")
-    file = folder / f"{file_stem(env_id, recorded=False)}.onnx"
-    with replacing(file) as part:
-        export_onnx(model, part, env_id)
-    write_card(file, {"env_id": env_id, "options": OPTIONS})
+def make(seed: int, updates: int, folder: Path) -> Run:
+    """Train the policy, unless that has been done, and write it as ONNX, with the options that it needs beside it."""
+    run = zoo_run("lac", ENV_ID, seed, updates=updates, differing={"env_kwargs": TRAINED_WITH})
+    export_onnx(train_or_load(run, folder / "models"), file_of(folder), ENV_ID)
+    write_card(file_of(folder), {"env_id": ENV_ID, "options": OPTIONS})
     return run
 
 
-def part(env_id: str, recipe: str, mismatch: float, sensor: str, discharges: int, folder: Path) -> Tables:
-    """Score a policy."""
-    policy, options = policy_of_file(folder / f"{file_stem(env_id, recorded=False)}.onnx")
+def file_of(folder: Path) -> Path:
+    """File of the policy."""
+    return folder / f"{file_stem(ENV_ID, recorded=False)}.onnx"
+
+
+def part(recipe: str, mismatch: float, sensor: str, discharges: int, folder: Path) -> Tables:
+    """Score the policy."""
+    policy, options = policy_of_file(file_of(folder))
     data = standard_dataset(PARAMETER_NAMES, "piecewise", "test", mismatch=mismatch)[:discharges]
-    scores = evaluate(PolicyEstimator(policy, env_id, **options), data, SENSORS[sensor], seed=1)
-    return {"pretrained": scores.assign(env_id=env_id, recipe=recipe, mismatch=mismatch, sensor=sensor)}
+    scores = evaluate(PolicyEstimator(policy, ENV_ID, **options), data, SENSORS[sensor], seed=1)
+    return {"pretrained": scores.assign(env_id=ENV_ID, recipe=recipe, mismatch=mismatch, sensor=sensor)}
 
 
 def summary(scores: pd.DataFrame) -> pd.DataFrame:
@@ -125,31 +126,19 @@ def summary_text(table: pd.DataFrame) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = command_line("pretrained", __doc__, jobs=1)
-    parser.add_argument("--envs", nargs="+", choices=ENV_IDS, default=ENV_IDS, metavar="ID")
     parser.add_argument("--seed", type=natural, default=0)
     parser.add_argument("--updates", type=positive, default=5000, help="gradient steps")
     parser.add_argument("--discharges", type=at_most(HELD_OUT), default=60, help="test discharges of the evaluation")
     study = Study(parser, arguments)
     chosen = study.chosen
     study.configuration |= {"trained_with": TRAINED_WITH, "options": OPTIONS}
-    runs = {env_id: make(env_id, chosen.seed, chosen.updates, study.out) for env_id in chosen.envs}
-    parts = [
-        {
-            "env_id": env_id,
-            "recipe": f"{run.digest}_{run.seed}",
-            "mismatch": mismatch,
-            "sensor": sensor,
-            "discharges": chosen.discharges,
-        }
-        for env_id, run in runs.items()
-        for mismatch in MISMATCHES
-        for sensor in SENSORS
-    ]
+    run = make(chosen.seed, chosen.updates, study.out)
+    of_all = {"recipe": f"{run.digest}_{run.seed}", "discharges": chosen.discharges}
+    parts = [{**of_all, "mismatch": mismatch, "sensor": sensor} for mismatch in MISMATCHES for sensor in SENSORS]
     scores = study.run(part, parts, folder=study.out)["pretrained"]
     table = summary(scores)
-    for env_id, run in runs.items():
-        own, file = table[table["env_id"] == env_id], study.out / f"{file_stem(env_id, recorded=False)}.onnx"
-        write_card(file, card_of(run, own, study.command, made_by(run, study.out / "models")["training_minutes"]))
+    minutes = made_by(run, study.out / "models")["training_minutes"]
+    write_card(file_of(study.out), card_of(run, table, study.command, minutes))
     study.write({"pretrained": scores, "pretrained_summary": table}, {}, summary_text(table))
 
 

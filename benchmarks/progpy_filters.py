@@ -62,14 +62,11 @@ class BatteryWithUnknown(BatteryElectroChemEOD):
 class ProgpyFilter(Estimator):
     """One of progpy's state estimators on the voltage of a discharge of a full cell, new but for one parameter (C or ohm)."""
 
-    def __init__(
-        self, parameter: str, kind: Literal["ukf", "particles"], prior_sd: float, voltage_noise_V: float, seed: int = 0
-    ) -> None:
+    def __init__(self, parameter: str, kind: Literal["ukf", "particles"], prior_sd: float, voltage_noise_V: float) -> None:
         self.parameter = parameter
         self.kind = kind
         self.prior_sd = prior_sd
         self.voltage_noise_V = voltage_noise_V
-        self.seed = seed
 
     def estimate(self, record: Record) -> Estimate:
         """The estimate at the last sample of a record."""
@@ -106,8 +103,8 @@ class ProgpyFilter(Estimator):
             )
             estimator: Any = ukf
         else:
-            np.random.seed(self.seed)  # progpy draws from numpy's global generator
-            draws = self.prior_sd * np.random.default_rng(self.seed).standard_normal((100, 1))
+            np.random.seed(0)  # progpy draws from numpy's global generator
+            draws = self.prior_sd * np.random.default_rng(0).standard_normal((100, 1))
             particles = np.maximum(state + draws * slope, 1e-3)
             x0 = UnweightedSamples([dict(zip(model.states, particle, strict=True)) for particle in particles])
             estimator = ParticleFilter(model, x0, measurement_noise={"v": self.voltage_noise_V}, t0=start_s)

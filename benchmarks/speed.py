@@ -20,8 +20,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
@@ -33,7 +31,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import trange
 
-from battery_env import OnnxPolicy, PolicyEstimator
+from battery_env import PolicyEstimator
 from battery_env.electrochemistry import NEW_CELL, simulate
 from battery_env.estimators.estimator import OnlineEstimator
 from battery_env.records import Stream
@@ -157,10 +155,9 @@ def measure_gpu(rounds: int) -> tuple[pd.DataFrame, str]:
     return pd.concat(tables).assign(GPU=th.cuda.get_device_name()), markdown(rows)
 
 
-def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
+def filter_contestants() -> dict[str, Callable[[], int]]:
     """Calibrators that follow a stream of one sample a second, here and in progpy, which knows ``r_o``."""
     from benchmarks.progpy_filters import ProgpyFilter  # heavy, and needed here only
-    from sb3_lac.onnx import export_onnx
 
     discharge = simulate(2.0, 6000.0, 0.15, load_unit="current", thermal=True)
     record = replace(
@@ -183,9 +180,6 @@ def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
     return {
         "plain extended Kalman filter": partial(stream, PlainKalmanFilter(thermal=True)),
         "PolicyEstimator": partial(stream, PolicyEstimator(model, _POLICY_ENV)),
-        "PolicyEstimator, ONNX": partial(
-            stream, PolicyEstimator(OnnxPolicy(export_onnx(model, folder / "p.onnx")), _POLICY_ENV)
-        ),
         "PolicyEstimator.pretrained()": partial(stream, PolicyEstimator.pretrained()),
         "progpy, unscented Kalman filter": partial(peer, "ukf", _PROGPY_SAMPLES),
         "progpy, 100 particles": partial(peer, "particles", _PARTICLES_SAMPLES),
@@ -194,8 +188,7 @@ def filter_contestants(folder: Path) -> dict[str, Callable[[], int]]:
 
 def measure_filters(rounds: int) -> tuple[pd.DataFrame, str]:
     """Measure how long an update of a calibrator takes."""
-    with TemporaryDirectory() as folder:
-        speeds = race(filter_contestants(Path(folder)), rounds, time.process_time)
+    speeds = race(filter_contestants(), rounds, time.process_time)
     return speeds, report_filters(speeds)
 
 

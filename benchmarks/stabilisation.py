@@ -45,7 +45,7 @@ from benchmarks.control import (
     controllers,
     judge,
     tried,
-    tried_with,
+    while_training,
 )
 from benchmarks.runs import Run, control_networks, made_by, train_or_load
 from benchmarks.study import (
@@ -111,25 +111,18 @@ CONTENDERS = {
 #: How they are drawn: colour and marker.
 STYLES = {each.label: (each.colour, each.marker) for each in CONTENDERS.values()}
 STYLES |= dict(zip({**FACTORS, **LINEAR_FACTORS}, (("black", marker) for marker in "|123x"), strict=True))
-# episodes of learning curves, with other starts than those of all other judgements
-_CURVE_EPISODES, _CURVE_SEED = 30, 40_000
 
 
-def while_training(model: BaseAlgorithm, run: Run) -> dict[str, float]:
-    """A point of a learning curve: what the mean action costs."""
+def point_of(model: BaseAlgorithm, run: Run) -> dict[str, float]:
+    """A point of a learning curve."""
     updates = getattr(model, "_n_updates", np.nan)
-    return {"timesteps": model.num_timesteps, "updates": updates, **_cost_of(model, run.task)}
-
-
-def _cost_of(policy: PolicyPredictor, env_id: str) -> dict[str, float]:
-    outcome = tried_with(policy, env_id, _CURVE_EPISODES, {}, seed=_CURVE_SEED)
-    return {name: outcome[name] for name in ("cost", "at_goal")}
+    return {"timesteps": model.num_timesteps, "updates": updates, **while_training(model, run.task, {})}
 
 
 def trained(run: Run, models: Path, compiled: bool) -> tuple[BaseAlgorithm, dict[str, Any], pd.DataFrame]:
     """Train a policy, unless that has been done: the model, what its training took, and its learning curve."""
     folder = models / run.name
-    model = train_or_load(run, folder, while_training, compiled=compiled)
+    model = train_or_load(run, folder, point_of, compiled=compiled)
     record = made_by(run, folder)
     took = {name: record[name] for name in ("timesteps", "updates", "training_minutes")}
     return model, took, pd.DataFrame(record["curve"])
@@ -150,7 +143,7 @@ def part(
     if run is None:
         predictor, label, recipe = controllers(env_id)[policy], policy, None
         took: dict[str, Any] = dict.fromkeys(("timesteps", "updates", "training_minutes"))
-        learning = pd.DataFrame([{"timesteps": np.nan, "updates": np.nan, **_cost_of(predictor, env_id)}])
+        learning = pd.DataFrame([{"timesteps": np.nan, "updates": np.nan, **while_training(predictor, env_id, {})}])
     else:
         made_from = Run(**run)
         predictor, took, learning = trained(made_from, models, compiled)

@@ -55,7 +55,6 @@ REFUSED = {
     ],
     "invalid choice:": [
         *("calibrators everything", "direct_mapping --algos ppo", "cells real_cells --cells B0007"),
-        *("pretrained --envs BatteryQmax-v0",),
     ],
 }
 

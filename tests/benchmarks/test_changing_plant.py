@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import changing_plant, runs
+from benchmarks import changing_plant, control, runs
 from benchmarks.control import DISTURBANCES, conditions
 
 IDS = list(changing_plant.PARAMETERS)
@@ -71,7 +71,7 @@ def test_cells_are_counted_where_lac_is_ahead_or_level_with_those_that_saw_the_s
 @pytest.mark.attacks
 def test_the_study_trains_and_writes(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(changing_plant, "EPISODES", 2)
-    monkeypatch.setattr(changing_plant, "_CURVE_EPISODES", 2)
+    monkeypatch.setattr(control, "CURVE_EPISODES", 2)
     command = ["--envs", "CartPoleCost-v0", "--timesteps", "40", "--seeds", "1", "--last-actions", "0", "2", "--jobs", "1"]
     command += ["--out", str(tmp_path), "--checkpoints", str(tmp_path / "checkpoints"), "--algos", "lac", "sac"]
     changing_plant.main(command)

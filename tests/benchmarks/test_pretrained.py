@@ -22,7 +22,7 @@ def test_it_writes_a_policy_with_its_card(train_nothing, tmp_path, monkeypatch, 
     asked = train_nothing(pretrained)
     monkeypatch.setattr(pretrained, "MISMATCHES", (0.0, 0.2))
     monkeypatch.setattr(pretrained, "standard_dataset", few)
-    arguments = [*"--envs BatteryVoltageJoint-v0 --updates 100 --discharges 2 --jobs 1 --out".split(), str(tmp_path)]
+    arguments = [*"--updates 100 --discharges 2 --jobs 1 --out".split(), str(tmp_path)]
     pretrained.main(arguments)
     assert [each[:3] for each in asked] == [("sb3_lac:LAC", "BatteryVoltageJoint-v0", 0)]
     policy, options = policy_of_file(tmp_path / "BatteryVoltageJoint-v0.onnx")

@@ -107,8 +107,6 @@ def test_what_is_compiled_and_how_large_the_buffer_is_is_no_part_of_a_run():
     env = RUN.environments()
     model = RUN.model(env, compiled=True)
     assert model.compile_update and model.replay_buffer.buffer_size == 60 and RUN.key == replace(RUN).key
-    of_td3 = replace(RUN, kind="stable_baselines3:TD3", settings={"noise_type": "normal", "noise_std": 0.2}).model(env, False)
-    assert of_td3.action_noise._sigma.tolist() == [0.2]
     env.close()
 
 

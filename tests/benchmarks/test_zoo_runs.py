@@ -18,7 +18,6 @@ from benchmarks.runs import Run, record_file, train_or_load
 from benchmarks.study import digest_of, own_versions
 from benchmarks.zoo_runs import zoo_run
 from sb3_lac import LAC
-from sb3_lac.compiled import update as compiled
 
 ENV_ID = "LinearCost-v0"
 CONFIG = """
@@ -119,14 +118,6 @@ def test_a_digest_names_all_that_was_run_but_the_seed(tmp_path):
     (tmp_path / "zoo_configs" / "lac.yml").write_text(CONFIG)
     seeds = [zoo_run("lac", ENV_ID, seed) for seed in (0, 1)]
     assert seeds[0] == run and seeds[0].digest == seeds[1].digest and seeds[0].name != seeds[1].name
-
-
-@pytest.mark.attacks
-def test_compilation_is_no_part_of_a_run(tmp_path, monkeypatch, trainings):
-    monkeypatch.setattr(compiled, "BACKEND", "eager")
-    assert train(25, tmp_path, compiled=True).compile_update
-    trainings.clear()
-    assert train(25, tmp_path).num_timesteps == 25 and not trainings
 
 
 def test_an_algorithm_may_name_whose_settings_it_has(model_of):

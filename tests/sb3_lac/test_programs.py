@@ -209,18 +209,22 @@ def test_a_replay_buffer_of_another_environment_is_refused_and_the_model_goes_on
 
 
 @pytest.mark.parametrize("algorithm", [LAC, PublishedLAC])
-def test_a_policy_that_is_put_into_a_model_is_trained(make_model, algorithm):
+def test_a_policy_that_is_put_into_a_model_is_trained_and_all_its_targets_have_the_statistics_of_what_they_follow(
+    make_model, algorithm
+):
     model = make_model(algorithm=algorithm, policy_kwargs={"features_extractor_class": NormalizedEncoder})
-    model.policy = copy.deepcopy(model.policy)
+    policy = model.policy = copy.deepcopy(model.policy)
     model._create_aliases()
-    norms = [network.features_extractor.norm for network in (model.policy.critic, model.policy.critic_target)]
-    tensors = [*model.policy.actor.mu.parameters(), *norms[1].parameters(), norms[1].running_mean]
+    followed = [(policy.critic, policy.critic_target)]
+    followed += [(policy.actor, policy.actor_target)] if algorithm is PublishedLAC else []
+    norms = [[network.features_extractor.norm for network in pair] for pair in followed]
+    tensors = [*policy.actor.mu.parameters()]
+    tensors += [each for _, target in norms for each in (*target.parameters(), target.running_mean, target.running_var)]
     before = [each.clone() for each in tensors]
     model.train(1)
     assert not any(th.equal(*pair) for pair in zip(before, tensors, strict=True))
-    assert th.equal(norms[0].running_mean, norms[1].running_mean)
-    if algorithm is PublishedLAC:
-        assert model.actor_target is model.policy.actor_target
+    for norm, target in norms:
+        assert th.equal(norm.running_mean, target.running_mean) and th.equal(norm.running_var, target.running_var)
 
 
 class NormalizedEncoder(Encoder):
