@@ -232,7 +232,7 @@ def life_table(lives: dict[str, Life], remaining: pd.DataFrame) -> pd.DataFrame:
     """The summary over cycles."""
     table = []
     for cell, life in lives.items():
-        expected = [life.after(n).later_q_mobile_C(1) for n in range(1, len(life.table))]
+        expected = [life.after(n).next_q_mobile_C for n in range(1, len(life.table))]
         mean_C, sd_C = np.array(expected).T
         q_C = life.table["q_mobile_C"].to_numpy()[1:]
         error = np.abs(q_C / mean_C - 1.0)

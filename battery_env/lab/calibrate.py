@@ -108,7 +108,7 @@ def calibrate(
     names = (SettingsOptions if isinstance(source, Discharge) else Options).__annotations__
     check_options("calibrate", options, names)
     of_file = {name: options.pop(name) for name in options.keys() - SettingsOptions.__annotations__.keys()}
-    settings = replace(Settings() if settings is None else settings, **options)
+    settings = (Settings() if settings is None else settings).but(**options)
     if isinstance(source, Discharge):
         return calibrated(source, settings)
     file_format = FileFormat(**of_file | {"tester": find_tester(of_file.get("tester"))})

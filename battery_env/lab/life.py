@@ -143,6 +143,11 @@ class Life:
         difference = (share[1:] - share[0]) / np.maximum(share[1:], share[0])
         return sqrt(0.5 * float(np.nansum(difference**2)))
 
+    @property
+    def next_q_mobile_C(self) -> tuple[float, float]:
+        """Mean and standard deviation of ``q_mobile`` in the next discharge, C."""
+        return self.later_q_mobile_C(1)
+
     def later_q_mobile_C(self, count: int) -> tuple[float, float]:
         """Mean and standard deviation of ``q_mobile`` so many discharges after the last one, C."""
         weights = np.array([1.0, count])

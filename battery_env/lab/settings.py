@@ -140,6 +140,10 @@ class Settings:
         stated = {name: value for name in resolved._fields if (value := getattr(self, name)) is not None}
         return resolved._replace(**stated)
 
+    def but(self, **changes: Any) -> Settings:
+        """Return settings with some changes; options that nobody stated follow a changed cell."""
+        return replace(self, **changes)
+
     def expecting(self, current_A: FloatArray) -> Settings:
         """
         Return settings with the expected model error at the age of the prior, if no error is stated and the constants were

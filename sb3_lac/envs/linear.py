@@ -20,8 +20,8 @@ class LinearCostEnv(CostEnv):
     ## Description
 
     A force has to bring a lightly damped mass on a spring to rest, with little noise: the linear-quadratic regulator problem.
-    LAC can be compared with exact solutions here: the best policy (`optimal_gain`), and the value L of a linear policy
-    (`cost_to_go`).
+    LAC can be compared with exact solutions here: the best policy (`optimal_gain`), the value L of a linear policy
+    (`cost_to_go`), and the largest feasible alpha3 of the decrease condition (`largest_feasible_alpha3`).
 
         s' = A s + B u + w,    A = [[0.96, 0.2], [-0.2, 0.96]],  B = [[0], [0.5]],  w ~ N(0, noise_std^2 I)
 
@@ -160,3 +160,24 @@ class LinearCostEnv(CostEnv):
         next_states = states @ self.A.T + controls @ self.B.T
         stage_costs = np.einsum("ni,ij,nj->n", states, self.Q, states) + np.einsum("ni,ij,nj->n", controls, self.R, controls)
         return stage_costs + gamma * np.einsum("ni,ij,nj->n", next_states, p, next_states) + noise
+
+    def largest_feasible_alpha3(self, gain: np.ndarray, gamma: float, n_steps: int = 100) -> float:
+        """
+        The largest ``alpha3`` with which ``E[L(s', a')] - L(s, a) <= -alpha3 * c`` holds on average over roll-outs of a linear
+        policy from the starting states. The differences telescope: what counts is ``L`` at the start and at the end, and the
+        sum of the costs between.
+
+        :param gain: K of the policy ``u = -K s``, shape (1, 2)
+        :param gamma: The discount factor of ``L``
+        :param n_steps: Length of the roll-outs
+        :return: ``sum E[L - L'] / sum E[c]``
+        """
+        p = self.value_matrix(gain, gamma)
+        closed_loop = self.A - self.B @ gain
+        stage = self.Q + gain.T @ self.R @ gain
+        start = np.eye(2) / 3.0  # second moments of the uniform distribution on -1 .. 1
+        moments, costs = start, 0.0
+        for _ in range(n_steps):
+            costs += float(np.trace(stage @ moments))
+            moments = closed_loop @ moments @ closed_loop.T + self.noise_std**2 * np.eye(2)
+        return float(np.trace(p @ (start - moments)) / costs)

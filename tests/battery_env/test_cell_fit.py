@@ -322,14 +322,14 @@ class TestFiles:
         assert Settings().calibrator(NEW_CELL).bounds == LeastSquares().bounds
         assert not Settings(cell=dataclasses.replace(fit, thermal=False)).resolved.thermal
 
-    def test_what_is_stated_stays_as_stated_with_another_cell_and_nothing_else_does(self, fit):
+    @pytest.mark.parametrize("other", [Settings.but, dataclasses.replace])
+    def test_what_is_stated_stays_as_stated_with_another_cell_and_nothing_else_does(self, other, fit):
         isothermal = dataclasses.replace(fit, thermal=False)
         # also where what is stated is what holds when nothing is
         for stated in ({"mismatch_V": 0.05}, {"cut_off_V": 2.7}, {"thermal": True}, {"mismatch_V": 0.1, "cut_off_V": 3.0}):
             for cell in (fit, isothermal, OTHER, None):
                 whole = Settings(**stated, cell=cell)
-                for settings in (Settings(**stated), Settings(**stated, cell=fit)):
-                    assert dataclasses.replace(settings, cell=cell) == whole
+                assert other(Settings(**stated), cell=cell) == whole == other(Settings(**stated, cell=fit), cell=cell)
                 assert whole.resolved == Settings(cell=cell).resolved._replace(**stated)
 
     def test_settings_and_keywords_say_the_same(self, fit):

@@ -70,7 +70,7 @@ class TestSeries:
             life = followed(q_C[np.array(numbers) - 1], cycle=numbers)
             mean_C, sd_C = life.later_q_mobile_C(80 - numbers[-1])
             inside.append(abs(q_C[79] - mean_C) <= 1.645 * sd_C)
-            assert sd_C > 3.0 * life.later_q_mobile_C(1)[1] > 0.0
+            assert sd_C > 3.0 * life.next_q_mobile_C[1] > 0.0
         assert 0.8 <= np.mean(inside)
 
     def test_numbers_that_do_not_go_on_count_as_the_next(self):
