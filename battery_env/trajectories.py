@@ -274,6 +274,8 @@ class TrajectoryDataset(Sequence[Trajectory]):
             use a :meth:`subset` instead
         :raises ValueError: for no trajectories, or trajectories that differ otherwise
         """
+        if isinstance(trajectories, Trajectory):
+            raise TypeError("trajectories must be a list of them, got one Trajectory")
         for trajectory in trajectories:
             if not isinstance(trajectory, Trajectory):
                 raise TypeError(f"trajectories must hold Trajectory, got {type(trajectory).__name__}")

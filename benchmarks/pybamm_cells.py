@@ -134,7 +134,7 @@ def part(cell: str, seed: int) -> Tables:
     """A cell: simulate its life, fit it, and forecast the discharges that were not fitted."""
     life, cut_off_V, nominal_Ah = simulated(cell, seed)
     fit = fit_cell([life[n] for n in FITTED], cut_off_V)
-    settings, nothing = Settings(cell=fit), Settings(cut_off_V=cut_off_V)
+    settings = Settings(cell=fit)
     rows: list[dict[str, Any]] = []
     for n, discharge in enumerate(life):
         if n in FITTED or n < BEFORE:
@@ -147,7 +147,7 @@ def part(cell: str, seed: int) -> Tables:
             FIT: (settings, None),
             LIFE: (settings, before),
             OF_SIZE: (Settings(cut_off_V=cut_off_V, nominal_Ah=nominal_Ah), None),
-            NOTHING: (nothing, None),
+            NOTHING: (Settings(cut_off_V=cut_off_V), None),
         }
         start_s, end_s = discharge.loaded_part(cut_off_V).time_s[[0, -1]].tolist()
         for share in SHARES:

@@ -34,6 +34,7 @@ from battery_env.electrochemistry.cell import QNS as QNS
 from battery_env.electrochemistry.cell import QPS as QPS
 from battery_env.electrochemistry.cell import STATE_NAMES as STATE_NAMES
 from battery_env.electrochemistry.cell import STATE_SIZE as STATE_SIZE
+from battery_env.electrochemistry.cell import TB as TB
 from battery_env.electrochemistry.cell import UNCERTAIN_CONSTANTS as UNCERTAIN_CONSTANTS
 from battery_env.electrochemistry.cell import VO as VO
 from battery_env.electrochemistry.cell import VSP as VSP

@@ -391,7 +391,7 @@ def life_of(table: pd.DataFrame, doubt_share: ArrayLike = 0.0) -> Life:
     centre = np.log([PRIOR_STEP_SHARE, PRIOR_NOISE_SHARE])
     doubts = np.broadcast_to(np.asarray(doubt_share, dtype=np.float64), len(readings)).copy()
 
-    def filtered(logarithms: FloatArray) -> Any:
+    def filtered(logarithms: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
         step, noise = np.exp(np.clip(logarithms, -15.0, 0.0))
         return _filtered(readings, steps, valid, step, np.hypot(noise, doubts))
 
