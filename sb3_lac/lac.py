@@ -87,9 +87,9 @@ class LAC(CostAlgorithm):
     :param reward_bound: Largest reward that the environment can pay (before ``VecNormalize``), at least 0. If a larger
         reward is seen, or if ``None``, it is the largest one seen. ``gamma`` must be below 1 with a bound above 0.
     :param compile_update: Whether to compile each update to one graph (``torch.compile``), on a GPU a CUDA graph. Compiling
-        needs torch 2.11, and takes minutes at the first update and after a change of a constant like ``batch_size``. With
-        hooks, an optimizer with its own ``step()``, or an untested torch (above 2.13), LAC does not compile updates, and
-        warns.
+        needs torch 2.11, and takes half a minute to minutes at the first update and after a change of a constant like
+        ``batch_size``. With hooks, an optimizer with its own ``step()``, or an untested torch (above 2.13), LAC does not
+        compile updates, and warns.
     :param check_observations: Whether to refuse an observation that is not finite, or beyond 1.8e19. ``False`` is for a
         features extractor that handles such numbers: NaN as a missing reading, inf as nothing in range.
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)

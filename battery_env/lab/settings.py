@@ -72,7 +72,7 @@ class Settings:
     An option that nobody stated stays ``None`` and follows ``cell``; :attr:`resolved` has the numbers.
 
     :param method: method of calibration; ``None``: least squares. ``"policy"`` is the policy of the package, for both
-        parameters; its model is a new 18650 at constant temperature
+        parameters; its model has constants along the ageing of the bundled cells, at constant temperature
     :param cut_off_V: voltage at which the discharge ends, V; ``None``: the cut-off of the fit of ``cell``, or 2.7
     :param prior_q_mobile_C: mean and standard deviation of ``q_mobile`` before the discharge, C; ``None``: no prior
     :param mismatch_V: expected error of the model, V; ``None``: the error of the fit of ``cell``, or 0.05
@@ -120,7 +120,7 @@ class Settings:
         check_cut_off(self.resolved.cut_off_V)
 
     def _refuse_for_the_policy(self) -> None:
-        """Refuse settings that a policy cannot use: it has learned on one model, a new 18650."""
+        """Refuse settings that a policy cannot use: it has learned on one model."""
         defaults = {field.name: field.default for field in fields(self)} | {"mismatch_V": UNFITTED_MISMATCH_V}
         stated = vars(self) | self.resolved._asdict()
         for name in ("cell", "prior_q_mobile_C", "mismatch_V", "current_gain_sd", "initial_soc"):
