@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from math import exp, hypot, log, log1p, sqrt
 from pathlib import Path
@@ -18,14 +17,12 @@ from battery_env.electrochemistry import CellParameters, check_cell
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.estimators.diagnosis.rest import BELOW_REST_V, rest_voltage_V
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.priors import RATE_PRIOR_SD
 from battery_env.estimators.verdict import MISMATCH_MARGIN
 from battery_env.files import WrongFormatError, read_json, write_json
 from battery_env.parameters import Q_MOBILE
 from battery_env.records import ChargeBefore, DischargeStart
 
-#: How well the constants that say how fast a cell follows its load are known before any data, as standard deviations of their
-#: logarithms: kn of seven cells lies so far from a new one's, but for the one of NASA's that is reported.
-RATE_PRIOR_SD: Mapping[str, float] = {"kn": 3.0, "kp": 0.5, "tDiffusion": 0.5, "to": 0.5, "tsn": 0.5, "tsp": 0.5}
 #: Cells of one kind differ by so much in each of them, also as standard deviations of logarithms.
 SAME_KIND_SD = 0.2
 #: A constant is identified if the discharges leave less than this share of the standard deviation of its prior.

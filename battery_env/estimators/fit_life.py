@@ -12,11 +12,11 @@ import numpy as np
 
 from battery_env.electrochemistry import UNCERTAIN_CONSTANTS, CellParameters
 from battery_env.electrochemistry.aging_path import EQUILIBRIUM_NAMES, PATH_NAMES, AgingPath
-from battery_env.estimators.cell_fit import RATE_PRIOR_SD
 from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, INDEPENDENT_ERRORS, LIMIT_V, fit_cell
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.priors import RATE_PRIOR_SD
 from battery_env.estimators.search import Prior, Search, spread_over
 from battery_env.parameters import PARAMETER_NAMES
 from battery_env.records import CUT_OFF_V, Record, check_record

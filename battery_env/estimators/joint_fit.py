@@ -19,7 +19,6 @@ from battery_env.electrochemistry.model_error import ERRORS_PER_DISCHARGE, indep
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
 from battery_env.estimates import Estimate
 from battery_env.estimators.cell_fit import (
-    RATE_PRIOR_SD,
     UNFITTED_MISMATCH_V,
     CellFit,
     FittedConstant,
@@ -32,6 +31,7 @@ from battery_env.estimators.diagnosis.faults import RESOLUTION_V
 from battery_env.estimators.diagnosis.rest import ABOVE_REST_V, BELOW_REST_V, usual_start
 from battery_env.estimators.error import ErrorModel
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.priors import RATE_PRIOR_SD
 from battery_env.estimators.search import (
     MARGIN,
     JointSearch,

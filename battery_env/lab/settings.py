@@ -16,12 +16,12 @@ from battery_env.checks import check_positive, with_option_hints
 from battery_env.electrochemistry import NEW_CELL, CellParameters
 from battery_env.electrochemistry.aging_path import AgingPath
 from battery_env.electrochemistry.cell import Q_MOBILE_PER_CAPACITY, new_cell_of
-from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.estimates import Estimate
 from battery_env.estimates.findings import Finding, Reason
-from battery_env.estimators.cell_fit import RATE_PRIOR_SD, SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
+from battery_env.estimators.cell_fit import SAME_KIND_SD, UNFITTED_MISMATCH_V, CellFit, read_cell
 from battery_env.estimators.diagnosis.rest import InitialSoc, Start
 from battery_env.estimators.least_squares import LeastSquares
+from battery_env.estimators.priors import RATE_PRIOR_SD, explained_ratio
 from battery_env.estimators.search import SIZE_WIDTH, SizePrior
 from battery_env.estimators.verdict import PRIOR_LIMIT_SD
 from battery_env.parameters import Q_MOBILE
@@ -87,7 +87,7 @@ class Settings:
         kind, for least squares. ``None``: the constants of a new 18650
     :param cell_rates_sd: uncertainty of the rate constants of ``cell``: standard deviations of their logarithms, by name, for
         least squares. ``None``: for a fit its own; for a new 18650 the spread of cells of any kind
-        (:data:`battery_env.estimators.cell_fit.RATE_PRIOR_SD`), and for stated constants the spread of cells of one kind
+        (:data:`battery_env.estimators.priors.RATE_PRIOR_SD`), and for stated constants the spread of cells of one kind
     :param initial_soc: state of charge when the load is switched on, after a rest: a number, (mean, standard deviation), or
         ``"rest"``: computed from the voltage of at least a minute of rest before the load
     :param usual_start: how discharges of this cell start, such as ``Life.usual_start``: a start like this is full; ``None``:
@@ -265,12 +265,10 @@ class Settings:
             return PolicyEstimator.pretrained(recorded=True)
         resolved, rates_sd = self.resolved, self._rates_sd()
         initial_soc: InitialSoc = 1.0 if self.initial_soc == "rest" else self.initial_soc
-        # free constants of any kind of cell explain as much of the model error as q_mobile and r_o absorb
-        explained_ratio = UNFITTED_ERROR_RATIO if rates_sd is RATE_PRIOR_SD else 1.0
         return LeastSquares(
             cell=cell or self.constants,
             thermal=resolved.thermal,
-            mismatch_V=resolved.mismatch_V / explained_ratio,
+            mismatch_V=resolved.mismatch_V / explained_ratio(rates_sd),
             prior_q_mobile_C=self.prior_q_mobile_C,
             current_gain_sd=self.current_gain_sd,
             initial_soc=initial_soc if start is None else (start.soc, start.sd_soc),

@@ -12,8 +12,9 @@ from battery_env.electrochemistry import NEW_CELL, initial_state, simulate, volt
 from battery_env.electrochemistry.equilibrium import with_equilibrium
 from battery_env.electrochemistry.model_error import UNFITTED_ERROR_RATIO
 from battery_env.electrochemistry.tangents import RATE_CONSTANTS
-from battery_env.estimators.cell_fit import RATE_PRIOR_SD, CellFit, read_cell
+from battery_env.estimators.cell_fit import CellFit, read_cell
 from battery_env.estimators.joint_fit import EQUILIBRIUM_PRIOR_SD_V, JointFit
+from battery_env.estimators.priors import RATE_PRIOR_SD
 from battery_env.estimators.search import JointSearch
 from battery_env.lab.calibrate import calibrate
 from battery_env.lab.running import forecast_end
