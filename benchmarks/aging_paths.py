@@ -1,7 +1,8 @@
 """
 How far the ageing of one recorded cell tells of another one: the path of a life as the prior of least squares and of policies
-that learned on cells along it, on discharges of the cell whose life it is not, whole and in progress. Beside them the filter,
-with that prior and with none, a regression that has the capacities of the life for labels, and who knows the cell's own life.
+that learned on cells along it, on discharges of the cell whose life it is not, whole and in progress. Beside them a plain filter
+with that prior, the command with none, a regression that has the capacities of the life for labels, and who knows the cell's
+own life.
 
 .. code-block:: bash
 
@@ -75,7 +76,7 @@ CUT_OFF_V = 2.7
 SHARES = (0.25, 0.5, 0.75, 1.0)
 CELLS = {"B0005": "B0006", "B0006": "B0005"}
 ENV_ID = "BatteryVoltageJoint-v0"
-PATH, FILTER, LAST = "least squares, path of {}", "what the command says, nothing known", "as long as the last"
+PATH, NOTHING_KNOWN, LAST = "least squares, path of {}", "what the command says, nothing known", "as long as the last"
 OWN_LIFE, BOTH, KALMAN = "own life so far", "own life so far, path of {}", "Kalman filter, path of {}"
 LABELLED, FIT = "regression on the labels of {}", "the fit that policies see, path of {}"
 LABELS = {"lac": "LAC", "sac": "SAC", "published_lac": "LAC as published"}
@@ -229,7 +230,7 @@ def _said(
         record = seen.loaded_part(CUT_OFF_V)
         yield {"method": KALMAN.format(life), **_row(path, whole, share, record, *_filtered(path, record))}
         ahead = forecast_end(seen, Settings(cut_off_V=CUT_OFF_V))
-        yield {"method": FILTER, "share": share, **_end(whole, ahead.eod_quantile_s(BAND))}
+        yield {"method": NOTHING_KNOWN, "share": share, **_end(whole, ahead.eod_quantile_s(BAND))}
         yield {"method": LABELLED.format(life), "share": share, "error_percent": _regression(labelled, whole, record)}
         lasted_s = last.eod_time_s(CUT_OFF_V) - last.load_on_time_s
         yield {"method": LAST, "share": share, "error_percent": whole.off(whole.start_s + lasted_s)}
