@@ -1,8 +1,8 @@
 """
 How far the ageing of one recorded cell tells of another one: the path of a life as the prior of least squares and of policies
-that learned on cells along it, on discharges of the cell whose life it is not, whole and in progress. Beside them a plain filter
-with that prior, the command with none, a regression that has the capacities of the life for labels, and who knows the cell's
-own life.
+that learned on cells along it, on discharges of the cell whose life it is not, whole and in progress. Beside them a plain
+filter with that prior, the command with none, a regression that has the capacities of the life for labels, and who knows the
+cell's own life.
 
 .. code-block:: bash
 
