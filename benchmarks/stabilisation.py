@@ -11,10 +11,11 @@ costs, whether it ends at the goal, what disturbances that it was not trained fo
 Policies are trained without disturbances, with the hyperparameters of ``zoo_configs``, and judged by their mean action. All of
 them have the same starts and disturbances. ``sac_common``, ``td3_common`` and ``tqc_common`` have the one setting of LAC for
 all problems in place of their own for each; ``published_lac`` has it too, and ``published_lac_paper`` that of its authors.
-``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is LAC's from what is the metric's. Critics of
-``lac_square_root`` learn that root, and those of ``lac`` the fourth. What is done is not done again when the command is
-repeated, so that seeds can be added. Without algorithms only controllers are judged, which takes minutes; with
-``--weak-controllers`` also those with too little gain or the wrong sign, of which a certificate must not say that they settle.
+``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is LAC's from what is the metric's. ``lac`` has
+its entry in ``zoo_configs``, with the fourth root; ``lac_default_root`` and ``lac_square_root`` differ from it in the root, and
+``lac_as_typed`` has no argument but policy and environment. What is done is not done again when the command is repeated, so
+that seeds can be added. Without algorithms only controllers are judged, which takes minutes; with ``--weak-controllers`` also
+those with too little gain or the wrong sign, of which a certificate must not say that they settle.
 ``tensorboard --logdir results/stabilisation/models`` overlays the curves of all trainings.
 """
 
@@ -94,9 +95,9 @@ _NOISE = {"noise_type": "normal", "noise_std": 0.1}
 _LAC, _PUBLISHED, _SAC, _TD3, _TQC = (COLOUR_OF[name] for name in ("LAC", "LAC as published", "SAC", "TD3", "TQC"))
 #: Who is judged, by the name on the command line.
 CONTENDERS = {
-    "lac": Contender("lac", "LAC", _LAC, "o"),
     "lac_as_typed": Contender("lac", "LAC, as typed", _LAC, "<", defaults=True),
-    "lac_default_root": Contender("lac", "LAC, its default root", _LAC, "*", differing=_NETWORKS),
+    "lac_default_root": Contender("lac", "LAC", _LAC, "*", differing=_NETWORKS),
+    "lac": Contender("lac", "LAC (root=4)", _LAC, "o"),
     "lac_square_root": Contender("lac", "LAC (root=2)", _LAC, "d", differing={"policy_kwargs": control_networks(2)}),
     "published_lac": Contender("published_lac", "LAC as published", _PUBLISHED, "P"),
     "published_lac_paper": Contender("published_lac", "LAC as published, its setting", _PUBLISHED, "X", "published_lac"),

@@ -118,21 +118,21 @@ def test_stabilisation_is_written_and_seeds_can_be_added(tmp_path, quick, capsys
     assert quick == [("sb3_lac:LAC", "LinearCost-v0", 0, 20_000), ("sb3_lac:LAC", "LinearCost-v0", 1, 20_000)]
     names = ("stabilisation", "certificates", "learning")
     results, certificates, learning = (pd.read_csv(tmp_path / f"{name}.csv") for name in names)
-    assert results["policy"].tolist() == 12 * ["LAC"] + 6 * ["reference"]
+    assert results["policy"].tolist() == 12 * ["LAC (root=4)"] + 6 * ["reference"]
     assert certificates["function"].tolist() == ["fitted", "critic", "fitted", "critic", "fitted"]
     # Statements are made once for each policy
     assert certificates["survives_at_least"].notna().tolist() == [True, False, True, False, True]
     assert (certificates["cost_bound_low"] <= certificates["cost_bound"]).all() and certificates["start_cost"].gt(0).all()
     assert (results["training_minutes"].iloc[:12] == 1.5).all()
-    assert learning["policy"].tolist() == ["LAC", "LAC", "reference"] and learning["cost"].notna().all()
+    assert learning["policy"].tolist() == ["LAC (root=4)", "LAC (root=4)", "reference"] and learning["cost"].notna().all()
     assert list(learning) == ["environment", "policy", "seed", "timesteps", "updates", "cost", "at_goal"]
     # An untrained policy is no match for the optimum, whose starts it has
     undisturbed = results[results["disturbance"] == "none"].set_index("policy")["cost"]
-    assert undisturbed["LAC"].gt(undisturbed["reference"]).all()
+    assert undisturbed["LAC (root=4)"].gt(undisturbed["reference"]).all()
     record = json.loads((tmp_path / "stabilisation.json").read_text())
     assert record["configuration"]["disturbances"]["LinearCost-v0"]["action delay"] == {"action_delay": 2}
     text = (tmp_path / "stabilisation.md").read_text(encoding="utf-8")
-    assert text in capsys.readouterr().out and "| LAC (critic)" in text and "nan" not in text
+    assert text in capsys.readouterr().out and "| LAC (root=4) (critic)" in text and "nan" not in text
     assert (tmp_path / "learning.png").stat().st_size > 1000
 
 
