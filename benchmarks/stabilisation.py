@@ -12,7 +12,7 @@ Policies are trained without disturbances, with the hyperparameters of ``zoo_con
 them have the same starts and disturbances. ``sac_common``, ``td3_common`` and ``tqc_common`` have the one setting of LAC for
 all problems in place of their own for each; ``published_lac`` has it too, and ``published_lac_paper`` that of its authors.
 ``metric_sac`` is SAC with critics that learn in LAC's metric, which tells what is LAC's from what is the metric's. ``lac`` has
-its entry in ``zoo_configs``, with the fourth root; ``lac_default_root`` and ``lac_square_root`` differ from it in the root and
+its entry in ``zoo_configs``, with the fourth root; ``lac_default_root`` and ``lac_square_root`` have other roots, and
 ``lac_as_typed`` has no argument but policy and environment. What is done is not done again when the command is repeated, so
 that seeds can be added. Without algorithms only controllers are judged, which takes minutes; with ``--weak-controllers`` also
 those with too little gain or the wrong sign, of which a certificate must not say that they settle.
